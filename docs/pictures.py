@@ -12,18 +12,18 @@ import tempfile
 from pathlib import Path
 
 import minimax_cal as mc
-from minimax_cal.reporting.plots.diagnosis import save_diagnosis
+from minimax_cal.reporting.plots.diagnosis_figure import save_diagnosis
 
 DOCS = Path(__file__).resolve().parent
 ROOT, IMAGES = DOCS.parent, DOCS / "images"
 sys.path += [str(DOCS), str(ROOT), str(ROOT / "examples")]
 
-from experiments.pages import RUNS  # noqa: E402
+from experiments.pages import PAGE_RUNS  # noqa: E402
 
 STUDIES = {  # picture: the study, and what it calls the picture in its folder
     "simulator_gap.png": ("simulator_gap", "simulator_gap_ladder"),
 }
-OF_PAGES = {picture for run in RUNS.values() for picture in run.pictures}
+OF_PAGES = {picture for run in PAGE_RUNS.values() for picture in run.pictures}
 
 
 def example() -> None:
@@ -75,7 +75,7 @@ def from_studies(names: list[str]) -> None:
 def main(names: list[str]) -> None:
     """Make the pictures of these names, or those of the program itself."""
     for name in OF_PAGES.intersection(names):
-        study = next(study for study, run in RUNS.items() if name in run.pictures)
+        study = next(study for study, run in PAGE_RUNS.items() if name in run.pictures)
         sys.exit(f"{name}: python -m experiments pages --run {study}")
     unknown = [name for name in names if name not in OWN and name not in STUDIES]
     if unknown:

@@ -12,9 +12,9 @@ import textwrap
 import matplotlib.pyplot as plt
 
 import minimax_cal as mc
-from minimax_cal.diagnosing.curves import residual_curve
+from minimax_cal.diagnosing.residual_curves import build_residual_curve
 from minimax_cal.modelling.simulate import Truth, simulate
-from minimax_cal.reporting.plots.diagnosis import draw_curve, draw_ladder
+from minimax_cal.reporting.plots.diagnosis_figure import draw_error_budget, draw_residual_curve
 
 # %%
 # The arm is a simulated UR10 whose joints give way under gravity by 2 µrad per N m. The diagnosis
@@ -32,10 +32,10 @@ for table in found.tables():
 # the turn of one joint that would explain each error, against its cause. Grey is the law as fitted.
 
 figure, (above, below) = plt.subplots(2, 1, figsize=(8, 7.5), layout="constrained")
-draw_ladder(above, found)
+draw_error_budget(above, found)
 rest = found.leftover()
-curve = residual_curve(rest)
-draw_curve(below, rest, curve)
+curve = build_residual_curve(rest)
+draw_residual_curve(below, rest, curve)
 below.set_title(curve.title, pad=22)
 plt.show()
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import minimax_cal as mc
 from minimax_cal.modelling.simulate import simulate
-from minimax_cal.reporting.plots.figures import save_errors
+from minimax_cal.reporting.plots.error_figure import save_errors
 
 
 def make(folder: Path) -> None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import minimax_cal as mc
-from minimax_cal.ground.arrays import Array
+from minimax_cal.core.arrays import Array
 from minimax_cal.instruments.instrument import SPOT, Instrument, Words, bare, spots_aside
 from minimax_cal.instruments.protocol import FlangePoses, ResidualRows
 from minimax_cal.instruments.wires import trilaterated

@@ -22,39 +22,39 @@ from functools import partial
 
 import numpy as np
 
-from experiments.conditions import ROBOTS, arm_of, robots_here
-from experiments.speed import fitted
+from experiments.conditions import CONDITION_ROBOTS, list_available_robots, load_or_simulate_robot
+from experiments.speed import fit_least_squares
 from experiments.sweep import Study, study_options
+from minimax_cal.core.arrays import Array
+from minimax_cal.core.tables import Table
+from minimax_cal.fitting.cell_fit import FIT_QP_TOLERANCE
 from minimax_cal.fitting.minimax_problem import (
     MinimaxProblem,
+    build_minimax_problem,
     measured_distances,
-    minimax_problem,
 )
-from minimax_cal.fitting.solve import QP_TOLERANCE
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.tables import Table
-from minimax_cal.measuring.grouping import split
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.modelling.parameters import State
+from minimax_cal.measuring.pose_groups import split_train_and_holdout
+from minimax_cal.modelling.parameters import ParameterValues
 from minimax_cal.modelling.simulate import simulate
 from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.solvers import minimax
 from minimax_cal.solvers.linearisation import Linearisation
 from qp_backends import solve as solve_qp
 
-ARMS = ("irb2600", "irb120", "ur10e", "meca500")  # simulated
-REAL = {"real irb120": "irb120", "real fanuc": "fanuc"}
-INNER = 3_000  # steps of the subgradient method, by the paper "while Δx not converge"
-OUTER = {True: 10, False: 20}
-SHOWN = (1, 2, 5, 10, 20)
-WAYS = {"as printed": False, "with a line search": True}
-OURS = ("subgradient:eliminated", "subgradient:raw")
-SHORTEST = 1e-6  # of a step in the line search
-GOOD = 1e-3  # over the optimum after ten outer steps: it works
+SIMULATED_ALGORITHM_1_ARMS = ("irb2600", "irb120", "ur10e", "meca500")  # simulated
+REAL_ALGORITHM_1_ARMS = {"real irb120": "irb120", "real fanuc": "fanuc"}
+INNER_ITERATIONS = 3_000  # steps of the subgradient method, by the paper "while Δx not converge"
+OUTER_ITERATIONS_BY_QUICK = {True: 10, False: 20}
+SHOWN_OUTER_STEPS = (1, 2, 5, 10, 20)
+ALGORITHM_1_VARIANTS = {"as printed": False, "with a line search": True}
+SUBGRADIENT_BACKENDS = ("subgradient:eliminated", "subgradient:raw")
+MIN_LINE_SEARCH_STEP = 1e-6  # of a step in the line search
+MAX_GOOD_EXCESS = 1e-3  # over the optimum after ten outer steps: it works
 
 
 @dataclass(frozen=True)
-class Job:
+class Algorithm1Job:
     """An arm."""
 
     arm: str
@@ -63,7 +63,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Course:
+class Algorithm1Result:
     """RMSE(φ) over the optimum minus one.
 
     ways: after each outer step, from the start on, by name.  ours: at the end, by backend.
@@ -73,40 +73,52 @@ class Course:
     ours: Mapping[str, float]
 
 
-def measured(job: Job) -> tuple[Robot, Measurements]:
+def load_or_simulate_arm(job: Algorithm1Job) -> tuple[Robot, Measurements]:
     """A simulated arm at 100 poses, or a real one's training poses of Table 3."""
-    if job.arm not in REAL:
+    if job.arm not in REAL_ALGORITHM_1_ARMS:
         robot = load_robot(job.arm)
         return robot, simulate(robot, 100, 3, job.seed).data
-    robot, data = arm_of(REAL[job.arm], job.seed)
-    return robot, split(data, 1.0 - ROBOTS[REAL[job.arm]][2] / data.poses, job.seed)[0]
+    robot, data = load_or_simulate_robot(REAL_ALGORITHM_1_ARMS[job.arm], job.seed)
+    return robot, split_train_and_holdout(
+        data, 1.0 - CONDITION_ROBOTS[REAL_ALGORITHM_1_ARMS[job.arm]][2] / data.poses, job.seed
+    )[0]
 
 
-def problem_of(job: Job, form: str) -> tuple[MinimaxProblem, State]:
+def build_minimax_problem_and_start(
+    job: Algorithm1Job, distance_form: str
+) -> tuple[MinimaxProblem, ParameterValues]:
     """The minimax of an arm and its start, the least squares [M eq. 32].
 
-    form: of the distances, squared as in M eq. 8.
+    distance_form: of the distances, squared as in M eq. 8.
     """
-    robot, data = measured(job)
-    model, start = fitted(robot, data)
-    return minimax_problem(model, start, measured_distances(data), form, "target"), start
+    robot, data = load_or_simulate_arm(job)
+    model, start = fit_least_squares(robot, data)
+    return build_minimax_problem(
+        model, start, measured_distances(data), distance_form, "target"
+    ), start
 
 
-def rows_of(at: Linearisation) -> tuple[Array, Array, Array]:
+def active_gradient_and_rows(linearisation: Linearisation) -> tuple[Array, Array, Array]:
     """∇F_I (p,), and the rows C (r,) and G (r, p) of M eq. 17 and 27."""
-    active = int(at.f.argmax())
-    C = np.concatenate([at.f - at.f.max(), at.c - 1.0])  # c_l = rt² - ε, over ε
-    G = np.concatenate([at.jacobian - at.jacobian[active], at.normal])
-    return at.jacobian[active], C, G
+    active = int(linearisation.f.argmax())
+    C = np.concatenate(
+        [linearisation.f - linearisation.f.max(), linearisation.c - 1.0]
+    )  # c_l = rt² - ε, over ε
+    G = np.concatenate(
+        [linearisation.jacobian - linearisation.jacobian[active], linearisation.normal]
+    )
+    return linearisation.jacobian[active], C, G
 
 
-def subproblem(H: Array, slope: Array, C: Array, G: Array) -> tuple[Array, Array]:
+def solve_subgradient_subproblem(
+    H: Array, gradient: Array, C: Array, G: Array
+) -> tuple[Array, Array]:
     """Δx and λ by the primal-dual subgradient method [M eq. 22-24, Algorithm 1, inner loop]."""
-    dx, lam = np.zeros(len(slope)), np.zeros(len(C))
-    for p in range(1, INNER + 1):
+    dx, lam = np.zeros(len(gradient)), np.zeros(len(C))
+    for p in range(1, INNER_ITERATIONS + 1):
         row = C + G @ dx
         violated = row > 0.0
-        T_x = H @ dx + slope + G[violated].T @ lam[violated]
+        T_x = H @ dx + gradient + G[violated].T @ lam[violated]
         T_lam = -np.where(violated, row, 0.0)
         size = math.sqrt(T_x @ T_x + T_lam @ T_lam)
         if size == 0.0:
@@ -116,35 +128,37 @@ def subproblem(H: Array, slope: Array, C: Array, G: Array) -> tuple[Array, Array
     return dx, lam
 
 
-def searched(problem: MinimaxProblem, x: State, dx: Array) -> float:
+def backtracking_step_length(problem: MinimaxProblem, x: ParameterValues, dx: Array) -> float:
     """The first of 1, 1/2, 1/4 ... whose step lowers the largest of the F_i and keeps c_l <= 0."""
 
-    def merit(at: State) -> float:
+    def merit(at: ParameterValues) -> float:
         f, c = problem.evaluate(at)
         return float(f.max() + 10.0 * np.maximum(c - 1.0, 0.0).sum())
 
     before, share = merit(x), 1.0
-    while share > SHORTEST and not merit(problem.step(x, share * dx)) < before:
+    while share > MIN_LINE_SEARCH_STEP and not merit(problem.step(x, share * dx)) < before:
         share *= 0.5
-    return share if share > SHORTEST else 0.0
+    return share if share > MIN_LINE_SEARCH_STEP else 0.0
 
 
-def algorithm_1(problem: MinimaxProblem, x: State, outer: int, *, search: bool) -> list[float]:
+def run_algorithm_1(
+    problem: MinimaxProblem, x: ParameterValues, outer_iterations: int, *, with_line_search: bool
+) -> list[float]:
     """The largest F_i at the start and after each outer step [M Algorithm 1]."""
     at = problem.linearise(x)
     H = at.curvature(np.full(len(at.f), 1.0 / len(at.f)))
     lam = np.zeros(len(at.f) + len(at.c))
     values = [float(at.f.max())]
-    for _ in range(outer):
-        slope, C, G = rows_of(at)
-        dx, after = subproblem(H, slope, C, G)
-        dx = (searched(problem, x, dx) if search else 1.0) * dx
+    for _ in range(outer_iterations):
+        slope, C, G = active_gradient_and_rows(at)
+        dx, after = solve_subgradient_subproblem(H, slope, C, G)
+        dx = (backtracking_step_length(problem, x, dx) if with_line_search else 1.0) * dx
         x = problem.step(x, dx)
         at = problem.linearise(x)
         values.append(float(at.f.max()))
         if not np.isfinite(values[-1]):
             break
-        next_slope, _, next_G = rows_of(at)
+        next_slope, _, next_G = active_gradient_and_rows(at)
         q = next_slope + next_G.T @ after - (slope + G.T @ lam)
         lam = after
         if q @ dx > 0.0:
@@ -153,47 +167,56 @@ def algorithm_1(problem: MinimaxProblem, x: State, outer: int, *, search: bool) 
     return values
 
 
-def course_of(job: Job, backends: Sequence[str] = OURS) -> Course:
+def run_all_variants(
+    job: Algorithm1Job, backends: Sequence[str] = SUBGRADIENT_BACKENDS
+) -> Algorithm1Result:
     """All ways on one arm, and our own search with some backends."""
-    problem, start = problem_of(job, "squared")
-    exact, _ = problem_of(job, "two-sided")  # the same set, with gradients that do not vanish
-    best = minimax.solve(exact, start, partial(solve_qp, name="daqp", tolerance=QP_TOLERANCE)).value
+    problem, start = build_minimax_problem_and_start(job, "squared")
+    exact, _ = build_minimax_problem_and_start(
+        job, "two-sided"
+    )  # the same set, with gradients that do not vanish
+    best = minimax.solve(
+        exact, start, partial(solve_qp, name="daqp", tolerance=FIT_QP_TOLERANCE)
+    ).value
 
     def over(value: float) -> float:
         return float(np.sqrt(value / best) - 1.0)
 
     ways = {
-        way: tuple(map(over, algorithm_1(problem, start, job.outer, search=search)))
-        for way, search in WAYS.items()
+        way: tuple(map(over, run_algorithm_1(problem, start, job.outer, with_line_search=search)))
+        for way, search in ALGORITHM_1_VARIANTS.items()
     }
     ours = {
         name: over(minimax.solve(exact, start, partial(solve_qp, name=name)).value)
         for name in backends
     }
-    return Course(ways, ours)
+    return Algorithm1Result(ways, ours)
 
 
-def study_of(study: Study) -> dict[Job, Course]:
+def run_all_cases(study: Study) -> dict[Algorithm1Job, Algorithm1Result]:
     """All arms that are here."""
-    arms = [*ARMS, *(arm for arm, name in REAL.items() if name in robots_here())]
-    jobs = [Job(arm, study.seed, OUTER[study.quick]) for arm in arms]
-    return dict(zip(jobs, study.sweep(course_of, jobs, "arms"), strict=True))
+    arms = [
+        *SIMULATED_ALGORITHM_1_ARMS,
+        *(arm for arm, name in REAL_ALGORITHM_1_ARMS.items() if name in list_available_robots()),
+    ]
+    jobs = [Algorithm1Job(arm, study.seed, OUTER_ITERATIONS_BY_QUICK[study.quick]) for arm in arms]
+    return dict(zip(jobs, study.sweep(run_all_variants, jobs, "arms"), strict=True))
 
 
-def table_of(found: Mapping[Job, Course]) -> Table:
+def build_excess_table(results: Mapping[Algorithm1Job, Algorithm1Result]) -> Table:
     """RMSE(φ) over the optimum after some outer steps, and of our backends at the end."""
-    steps = [step for step in SHOWN if all(step <= job.outer for job in found)]
+    steps = [step for step in SHOWN_OUTER_STEPS if all(step <= job.outer for job in results)]
     rows = []
-    for job, course in found.items():
+    for job, course in results.items():
         rows += [
-            (job.arm, way, values[0], *(reached(values, step) for step in steps))
+            (job.arm, way, values[0], *(excess_after_step(values, step) for step in steps))
             for way, values in course.ways.items()
         ]
         rows += [
             (job.arm, name, course.ways["as printed"][0], *[math.nan] * (len(steps) - 1), value)
             for name, value in course.ours.items()
         ]
-    return Table.made(
+    return Table.from_rows(
         "Algorithm 1 of paper M: RMSE(φ) over the optimum, minus one; our backends at their end",
         rows,
         "arm | way | start .1e",
@@ -201,21 +224,21 @@ def table_of(found: Mapping[Job, Course]) -> Table:
     )
 
 
-def reached(values: tuple[float, ...], step: int) -> float:
+def excess_after_step(values: tuple[float, ...], step: int) -> float:
     """After an outer step, infinite where the numbers broke down before."""
     return values[step] if step < len(values) else math.inf
 
 
-def save(study: Study, found: Mapping[Job, Course]) -> None:
+def save_results(study: Study, results: Mapping[Algorithm1Job, Algorithm1Result]) -> None:
     """The table."""
     content = {
         job.arm: {"ways": dict(course.ways), "ours": dict(course.ours)}
-        for job, course in found.items()
+        for job, course in results.items()
     }
-    study.save([table_of(found)], content)
+    study.save([build_excess_table(results)], content)
 
 
 @study_options("algorithm_1")
 def main(study: Study) -> None:
     """Paper M's Algorithm 1 to the letter, on simulated and real arms."""
-    save(study, study_of(study))
+    save_results(study, run_all_cases(study))

@@ -8,15 +8,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote
 
-from experiments.sweep import needed
-from minimax_cal.ground.files import write_whole
-from minimax_cal.ground.tables import Table
+from experiments.sweep import import_optional_module
+from minimax_cal.core.files import write_file_atomically
+from minimax_cal.core.tables import Table
 
-TEMPLATE = "index.html.jinja"
+INDEX_TEMPLATE = "index.html.jinja"
 
 
 @dataclass(frozen=True)
-class Outcome:
+class StudyOutcome:
     """How a study went: done, or failed with its error; files: what it wrote."""
 
     name: str
@@ -27,16 +27,18 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class Link:
+class FileLink:
     """A file to point at: where it is from the page, escaped for a URL, and its name."""
 
     url: str
     name: str
 
 
-def write_index(folder: Path, command: str, made_on: Table, outcomes: Sequence[Outcome]) -> Path:
+def write_index_page(
+    folder: Path, command: str, made_on: Table, outcomes: Sequence[StudyOutcome]
+) -> Path:
     """Write folder/index.html about the outcomes; every file shown lies below folder."""
-    jinja2 = needed("jinja2", "experiments")
+    jinja2 = import_optional_module("jinja2", "experiments")
     loader = jinja2.FileSystemLoader(Path(__file__).parent)
     pages = jinja2.Environment(
         loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True
@@ -44,38 +46,47 @@ def write_index(folder: Path, command: str, made_on: Table, outcomes: Sequence[O
     studies = [
         {
             "outcome": outcome,
-            "tables": [path.read_text("utf-8") for path in with_suffix(outcome, ".html")],
-            "figures": [
-                (link(folder, path), links(folder, outcome, path.with_suffix(".svg")))
-                for path in with_suffix(outcome, ".png")
+            "tables": [
+                path.read_text("utf-8") for path in list_files_with_suffix(outcome, ".html")
             ],
-            "links": links(folder, outcome, *with_suffix(outcome, ".csv", ".tex", ".json")),
+            "figures": [
+                (
+                    build_file_link(folder, path),
+                    build_file_links(folder, outcome, path.with_suffix(".svg")),
+                )
+                for path in list_files_with_suffix(outcome, ".png")
+            ],
+            "links": build_file_links(
+                folder, outcome, *list_files_with_suffix(outcome, ".csv", ".tex", ".json")
+            ),
         }
         for outcome in outcomes
     ]
-    page = pages.get_template(TEMPLATE).render(
-        command=command, made_on=made_on.cells(), studies=studies
+    page = pages.get_template(INDEX_TEMPLATE).render(
+        command=command, made_on=made_on.formatted_cells(), studies=studies
     )
-    write_whole(folder / "index.html", page)
+    write_file_atomically(folder / "index.html", page)
     return folder / "index.html"
 
 
-def with_suffix(outcome: Outcome, *suffixes: str) -> list[Path]:
+def list_files_with_suffix(outcome: StudyOutcome, *suffixes: str) -> list[Path]:
     """The study's files of these kinds, in the order of their numbers."""
     found = [path for path in outcome.files if path.suffix in suffixes]
-    return sorted(found, key=lambda path: (suffixes.index(path.suffix), natural(path.stem)))
+    return sorted(
+        found, key=lambda path: (suffixes.index(path.suffix), natural_sort_key(path.stem))
+    )
 
 
-def natural(text: str) -> list[tuple[int, str]]:
+def natural_sort_key(text: str) -> list[tuple[int, str]]:
     """Sorts table_10 after table_9."""
     return [(int(word), "") if word.isdigit() else (-1, word) for word in re.split(r"(\d+)", text)]
 
 
-def link(folder: Path, path: Path) -> Link:
+def build_file_link(folder: Path, path: Path) -> FileLink:
     """A file as seen from the page in folder."""
-    return Link(quote(path.relative_to(folder).as_posix()), path.name)
+    return FileLink(quote(path.relative_to(folder).as_posix()), path.name)
 
 
-def links(folder: Path, outcome: Outcome, *paths: Path) -> list[Link]:
+def build_file_links(folder: Path, outcome: StudyOutcome, *paths: Path) -> list[FileLink]:
     """Those of the paths that the study wrote."""
-    return [link(folder, path) for path in paths if path in outcome.files]
+    return [build_file_link(folder, path) for path in paths if path in outcome.files]

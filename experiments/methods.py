@@ -19,24 +19,32 @@ from pathlib import Path
 import click
 import numpy as np
 
-from experiments.hand_eye import mdh_pose, nominal
-from experiments.poe import poe_pose, poe_position
-from experiments.poses import Fit, orientation_error, poses_of, triangle
-from experiments.real import SHARED
+from experiments.hand_eye import fit_mdh_to_poses, fit_nominal_arm
+from experiments.pose_fitting import (
+    PointFit,
+    fit_poses_to_points,
+    orientation_error,
+    triangle_from_distances,
+)
+from experiments.product_of_exponentials import (
+    fit_screws_to_measured_poses,
+    fit_screws_to_one_target,
+)
+from experiments.real_arms import SHARED_DATA_FOLDER
 from experiments.sweep import Study, study_options
+from minimax_cal.core.arrays import Array, rms
+from minimax_cal.core.tables import Table, TableCell
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.options import Objective
-from minimax_cal.ground.arrays import Array, rms
-from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.measuring.measurements import Measurements, read_measurements
 from minimax_cal.modelling.simulate import simulate
 from minimax_cal.robots.robot import Robot, load_robot
 
-PARTS = ("training", "held out")
+POSE_SET_NAMES = ("training", "held out")
 
 
 @dataclass(frozen=True)
-class Case:
+class MethodCase:
     """A robot and how its poses are divided.
 
     source: folder of real measurements, "" for simulated ones (another arm each split).
@@ -50,33 +58,35 @@ class Case:
     splits: int
     folds: int = 0
 
-    def present(self, folder: Path) -> bool:
+    def has_measurements(self, folder: Path) -> bool:
         """Whether there are measurements."""
         return not self.source or (folder / self.source / "measurements.csv").exists()
 
 
-def cases(quick: bool) -> list[Case]:
+def list_cases(quick: bool) -> list[MethodCase]:
     """A simulated robot and two real ones."""
     splits = 1 if quick else 5
     out = [
-        Case("IRB 2600 sim", "ABB IRB 2600 (simulated, another arm each split)", "", 100, splits),
-        Case("IRB 120", "ABB IRB 120 (real)", "irb120", 100, splits),
-        Case("FANUC", "FANUC R-2000 (real)", "fanuc_r2000", 30, 2 if quick else 6, folds=6),
+        MethodCase(
+            "IRB 2600 sim", "ABB IRB 2600 (simulated, another arm each split)", "", 100, splits
+        ),
+        MethodCase("IRB 120", "ABB IRB 120 (real)", "irb120", 100, splits),
+        MethodCase("FANUC", "FANUC R-2000 (real)", "fanuc_r2000", 30, 2 if quick else 6, folds=6),
     ]
     if not quick:
-        out.insert(2, Case("IRB 120, 500 poses", "ABB IRB 120 (real)", "irb120", 500, splits))
+        out.insert(2, MethodCase("IRB 120, 500 poses", "ABB IRB 120 (real)", "irb120", 500, splits))
     return out
 
 
 @cache
-def measured(path: Path) -> tuple[Robot, Measurements]:
+def read_measured_robot(path: Path) -> tuple[Robot, Measurements]:
     """A real robot and its measurements, at the poses where all three SMRs were seen."""
     data = read_measurements(path / "measurements.csv")
     return load_robot(path / "robot.json"), data.take(np.asarray(data.seen.all(axis=1)))
 
 
-def divided(
-    case: Case, split: int, seed: int, folder: Path
+def load_and_split_robot(
+    case: MethodCase, split: int, seed: int, folder: Path
 ) -> tuple[Robot, Measurements, Measurements]:
     """Robot, training and held-out measurements of one split."""
     if not case.source:
@@ -84,7 +94,7 @@ def divided(
         data = simulate(robot, 3 * case.train, 3, 1000 * seed + split).data
         rows = np.arange(data.poses)
         return robot, data.take(rows[: case.train]), data.take(rows[case.train :])
-    robot, data = measured(folder / case.source)
+    robot, data = read_measured_robot(folder / case.source)
     if case.folds:
         number = np.random.default_rng(seed).permutation(data.poses) % case.folds
         return robot, data.take(number != split), data.take(number == split)
@@ -95,26 +105,28 @@ def divided(
 # ---- the methods: (robot, training data) -> Fit, each from the nominal geometry -------------
 
 
-def library(robot: Robot, train: Measurements, objective: Objective, method: str = "snllm") -> Fit:
+def fit_by_library(
+    robot: Robot, train: Measurements, objective: Objective, method: str = "snllm"
+) -> PointFit:
     """One of the library's objectives, on its set of identified parameters."""
     found = calibrate(robot, train, objective, holdout=0.0, method=method)
-    return Fit(found.cell.predict, str(found.status))
+    return PointFit(found.cell.predict, str(found.status))
 
 
-MINIMAX, POSE = "minimax", "MDH pose"
-SINGLE = ("MDH SMR 1", "MDH SMR 2", "MDH SMR 3")
-ONE_TARGET: tuple[Objective, ...] = ("smr:1", "smr:2", "smr:3")
-METHODS: Mapping[str, Callable[[Robot, Measurements], Fit]] = {
-    "nominal": nominal,
+MINIMAX_METHOD, POSE_METHOD = "minimax", "MDH pose"
+SINGLE_TARGET_METHODS = ("MDH SMR 1", "MDH SMR 2", "MDH SMR 3")
+SINGLE_TARGET_OBJECTIVES: tuple[Objective, ...] = ("smr:1", "smr:2", "smr:3")
+CALIBRATION_METHODS: Mapping[str, Callable[[Robot, Measurements], PointFit]] = {
+    "nominal": fit_nominal_arm,
     **{
-        name: partial(library, objective=one, method="nlgn")
-        for name, one in zip(SINGLE, ONE_TARGET, strict=True)
+        name: partial(fit_by_library, objective=one, method="nlgn")
+        for name, one in zip(SINGLE_TARGET_METHODS, SINGLE_TARGET_OBJECTIVES, strict=True)
     },
-    POSE: mdh_pose,
-    **{f"POE SMR {i + 1}": partial(poe_position, smr=i) for i in range(3)},
-    "POE pose": poe_pose,
-    "sum": partial(library, objective="sum"),
-    MINIMAX: partial(library, objective="minimax"),
+    POSE_METHOD: fit_mdh_to_poses,
+    **{f"POE SMR {i + 1}": partial(fit_screws_to_one_target, target_index=i) for i in range(3)},
+    "POE pose": fit_screws_to_measured_poses,
+    "sum": partial(fit_by_library, objective="sum"),
+    MINIMAX_METHOD: partial(fit_by_library, objective="minimax"),
 }
 
 
@@ -122,7 +134,7 @@ METHODS: Mapping[str, Callable[[Robot, Measurements], Fit]] = {
 
 
 @dataclass(frozen=True, eq=False)
-class Errors:
+class MethodErrors:
     """distance: (m, 3) of each SMR [m].  angle: (m,) AO' [rad]."""
 
     distance: Array
@@ -130,10 +142,10 @@ class Errors:
 
 
 @dataclass(frozen=True)
-class Job:
+class MethodJob:
     """One method on one split."""
 
-    case: Case
+    case: MethodCase
     split: int
     method: str
     seed: int
@@ -141,53 +153,57 @@ class Job:
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
+class MethodOutcome:
     """Errors by part, and what the fit took [s]."""
 
-    errors: Mapping[str, Errors]
+    errors: Mapping[str, MethodErrors]
     status: str
     seconds: float
 
 
-def outcome_of(job: Job) -> Outcome:
+def run_method(job: MethodJob) -> MethodOutcome:
     """Fit and judge."""
-    robot, train, held = divided(job.case, job.split, job.seed, job.folder)
+    robot, train, held = load_and_split_robot(job.case, job.split, job.seed, job.folder)
     began = time.perf_counter()
-    fit = METHODS[job.method](robot, train)
+    fit = CALIBRATION_METHODS[job.method](robot, train)
     seconds = time.perf_counter() - began
-    shape = triangle(train.y)
-    both = zip(PARTS, (train, held), strict=True)
-    errors = {part: errors_of(fit.predict(data.q), data.y, shape) for part, data in both}
-    return Outcome(errors, fit.status, seconds)
+    shape = triangle_from_distances(train.y)
+    both = zip(POSE_SET_NAMES, (train, held), strict=True)
+    errors = {
+        part: compute_method_errors(fit.predict(data.q), data.y, shape) for part, data in both
+    }
+    return MethodOutcome(errors, fit.status, seconds)
 
 
-def errors_of(predicted: Array, measured: Array, shape: Array) -> Errors:
+def compute_method_errors(
+    predicted: Array, measured: Array, triangle_points: Array
+) -> MethodErrors:
     """Errors of predicted points (m, 3, 3); orientations are those of the triangle."""
-    seen, computed = (poses_of(shape, y) for y in (measured, predicted))
+    seen, computed = (fit_poses_to_points(triangle_points, y) for y in (measured, predicted))
     distance = np.linalg.norm(measured - predicted, axis=-1)
-    return Errors(distance, orientation_error(seen, computed))
+    return MethodErrors(distance, orientation_error(seen, computed))
 
 
 # What is said of a method over its splits: RMS are pooled, the largest is the largest of all.
-FIGURES: Mapping[str, tuple[str, Callable[[Sequence[Errors]], float]]] = {
+ERROR_FIGURES: Mapping[str, tuple[str, Callable[[Sequence[MethodErrors]], float]]] = {
     "AP RMSE": ("mm", lambda e: 1e3 * rms(np.array([rms(s.distance) for s in e]))),
     "worst SMR": ("mm", lambda e: 1e3 * rms(np.array([max(map(rms, s.distance.T)) for s in e]))),
     "AP max": ("mm", lambda e: 1e3 * max(float(s.distance.max()) for s in e)),
     "AO' RMSE": ("mrad", lambda e: 1e3 * rms(np.array([rms(s.angle) for s in e]))),
     "AO' max": ("mrad", lambda e: 1e3 * max(float(s.angle.max()) for s in e)),
 }
-Results = Mapping[str, Sequence[Outcome]]  # by method, one a split
-Studies = Sequence[tuple[Case, Results]]
+Results = Mapping[str, Sequence[MethodOutcome]]  # by method, one a split
+Studies = Sequence[tuple[MethodCase, Results]]
 
 
-def figure_of(outcomes: Sequence[Outcome], figure: str, part: str) -> float:
-    """One entry of `FIGURES`."""
-    return FIGURES[figure][1]([outcome.errors[part] for outcome in outcomes])
+def pooled_figure(outcomes: Sequence[MethodOutcome], figure_name: str, pose_set: str) -> float:
+    """One entry of `ERROR_FIGURES`."""
+    return ERROR_FIGURES[figure_name][1]([outcome.errors[pose_set] for outcome in outcomes])
 
 
 # ---- tables and pictures ---------------------------------------------------------------------
 
-PROPERTIES = Table(
+METHOD_PROPERTIES_TABLE = Table(
     "what the methods are [paper M, Table 1, with its reference numbers]",
     ("method", "in M", "model", "measured", "minimises", "by", "orientation",
      "worst SMR bounded", "SMR distances"),
@@ -207,7 +223,7 @@ PROPERTIES = Table(
          "through three SMRs", "yes", "constrained"),
     ),
 )  # fmt: skip
-PRINTED = Table(
+PAPER_M_TABLE_4 = Table(
     "paper M, Table 4 as printed (training poses only; - where our texts lack the entry)",
     ("robot", "method", "RMSE(phi) mm", "max mm", "AO' RMSE mrad", "AO' max mrad"),
     (
@@ -224,30 +240,38 @@ PRINTED = Table(
 )
 
 
-def title_of(case: Case, results: Results) -> str:
+def format_case_title(case: MethodCase, results: Results) -> str:
     """The robot and how its poses were divided."""
     outcomes = next(iter(results.values()))
     if not outcomes:
         return f"{case.name}: data absent"
-    train, held = (len(outcomes[0].errors[part].angle) for part in PARTS)
+    train, held = (len(outcomes[0].errors[part].angle) for part in POSE_SET_NAMES)
     count = len(outcomes)
     kind = f"{count} of {case.folds} folds" if case.folds else f"{count} random split"
     kind += "s, pooled" if count > 1 and not case.folds else ""
     return f"{case.name}: {train} training poses, {held} held out, {kind}"
 
 
-def accuracy_table(case: Case, results: Results) -> Table:
+def build_accuracy_table(case: MethodCase, results: Results) -> Table:
     """Position and orientation errors of every method, training beside held out."""
-    units = {name: unit for name, (unit, _) in FIGURES.items()}
-    header = [f"{name} {units[name]}, {part} .3f" for name in units for part in PARTS]
+    units = {name: unit for name, (unit, _) in ERROR_FIGURES.items()}
+    header = [f"{name} {units[name]}, {part} .3f" for name in units for part in POSE_SET_NAMES]
     rows = [
-        (name, *(figure_of(outcomes, key, part) for key in FIGURES for part in PARTS))
+        (
+            name,
+            *(
+                pooled_figure(outcomes, key, part)
+                for key in ERROR_FIGURES
+                for part in POSE_SET_NAMES
+            ),
+        )
         for name, outcomes in results.items()
         if outcomes
     ]
     rows = rows or [("data absent", *[np.nan] * len(header))]
-    return Table.made(
-        f"{title_of(case, results)}.  AP: position errors of the SMRs; worst SMR: RMSE(phi) of "
+    return Table.from_rows(
+        f"{format_case_title(case, results)}.  AP: position "
+        f"errors of the SMRs; worst SMR: RMSE(phi) of "
         "paper M; AO': angle between orientations",
         rows,
         "method",
@@ -255,72 +279,88 @@ def accuracy_table(case: Case, results: Results) -> Table:
     )
 
 
-def claims_table(studies: Studies) -> Table:
+def build_claims_table(studies: Studies) -> Table:
     """Minimax against the paper's two competitors."""
     nan = np.nan
-    rows: list[tuple[Cell, ...]] = [
+    rows: list[tuple[TableCell, ...]] = [
         ("M, SR10", 0.206 / 0.207, nan, 0.206 / 0.207, nan, 1.0, nan, 1.0, nan),
         ("M, IRB 2600", 0.3323 / 0.3471, nan, 0.3323 / 0.3431, nan, 26 / 27, nan, 26 / 25, nan),
     ]
-    against = {"single SMR": SINGLE, "pose": (POSE,)}
+    against = {"single SMR": SINGLE_TARGET_METHODS, "pose": (POSE_METHOD,)}
     pairs = [(key, name) for key in ("worst SMR", "AO' RMSE") for name in against]
     for case, results in studies:
-        if results[MINIMAX]:
-            row: list[Cell] = [case.label]
+        if results[MINIMAX_METHOD]:
+            row: list[TableCell] = [case.label]
             for key, name in pairs:
-                for part in PARTS:
-                    theirs = [figure_of(results[other], key, part) for other in against[name]]
-                    row.append(figure_of(results[MINIMAX], key, part) / float(np.median(theirs)))
+                for part in POSE_SET_NAMES:
+                    theirs = [pooled_figure(results[other], key, part) for other in against[name]]
+                    row.append(
+                        pooled_figure(results[MINIMAX_METHOD], key, part) / float(np.median(theirs))
+                    )
             rows.append(tuple(row))
-    return Table.made(
+    return Table.from_rows(
         "errors of minimax over those of MDH pose and over the median of MDH SMR 1, 2, 3: below 1 "
         "minimax is better.  M: paper M, Table 4",
         rows,
         "robot",
-        *(f"{key} / {name}, {part} .3f" for key, name in pairs for part in PARTS),
+        *(f"{key} / {name}, {part} .3f" for key, name in pairs for part in POSE_SET_NAMES),
     )
 
 
 # ---- the study -------------------------------------------------------------------------------
 
-Sweep = Callable[[Callable[[Job], Outcome], Sequence[Job]], Iterable[Outcome]]
+Sweep = Callable[
+    [Callable[[MethodJob], MethodOutcome], Sequence[MethodJob]], Iterable[MethodOutcome]
+]
 
 
-def run(quick: bool, seed: int, folder: Path, sweep: Sweep = map) -> Studies:
+def run_all_methods(quick: bool, seed: int, folder: Path, map_jobs: Sweep = map) -> Studies:
     """All methods on all robots; no outcomes where data are absent."""
     jobs = [
-        Job(case, split, method, seed, folder)
-        for case in cases(quick)
-        if case.present(folder)
+        MethodJob(case, split, method, seed, folder)
+        for case in list_cases(quick)
+        if case.has_measurements(folder)
         for split in range(case.splits)
-        for method in METHODS
+        for method in CALIBRATION_METHODS
     ]
-    done = list(zip(jobs, sweep(outcome_of, jobs), strict=True))
+    done = list(zip(jobs, map_jobs(run_method, jobs), strict=True))
     return [
-        (case, {m: [o for job, o in done if (job.case, job.method) == (case, m)] for m in METHODS})
-        for case in cases(quick)
+        (
+            case,
+            {
+                m: [o for job, o in done if (job.case, job.method) == (case, m)]
+                for m in CALIBRATION_METHODS
+            },
+        )
+        for case in list_cases(quick)
     ]
 
 
-def study_of(study: Study, folder: Path = SHARED) -> Studies:
+def run_all_cases(study: Study, folder: Path = SHARED_DATA_FOLDER) -> Studies:
     """All methods on all robots."""
-    return run(study.quick, study.seed, folder, study.sweep)
+    return run_all_methods(study.quick, study.seed, folder, study.sweep)
 
 
-def save(study: Study, found: Studies) -> None:
+def save_results(study: Study, studies: Studies) -> None:
     """The tables."""
-    tables = [PROPERTIES, *(accuracy_table(case, results) for case, results in found)]
-    study.save([*tables, PRINTED, claims_table(found)], {"figures": numbers(found)})
+    tables = [
+        METHOD_PROPERTIES_TABLE,
+        *(build_accuracy_table(case, results) for case, results in studies),
+    ]
+    study.save(
+        [*tables, PAPER_M_TABLE_4, build_claims_table(studies)],
+        {"figures": list_json_figures(studies)},
+    )
 
 
-def numbers(studies: Studies) -> dict[str, object]:
+def list_json_figures(studies: Studies) -> dict[str, object]:
     """Every figure by robot, method and name, for other programs."""
     return {
         case.label: {
             name: {
-                f"{key}, {part} {unit}": figure_of(outcomes, key, part)
-                for key, (unit, _) in FIGURES.items()
-                for part in PARTS
+                f"{key}, {part} {unit}": pooled_figure(outcomes, key, part)
+                for key, (unit, _) in ERROR_FIGURES.items()
+                for part in POSE_SET_NAMES
             }
             for name, outcomes in results.items()
             if outcomes
@@ -330,7 +370,7 @@ def numbers(studies: Studies) -> dict[str, object]:
 
 
 @study_options("methods")
-@click.option("--data", "folder", type=click.Path(path_type=Path), default=SHARED)
+@click.option("--data", "folder", type=click.Path(path_type=Path), default=SHARED_DATA_FOLDER)
 def main(study: Study, folder: Path) -> None:
     """Calibration methods side by side, on simulated and real robots."""
-    save(study, study_of(study, folder))
+    save_results(study, run_all_cases(study, folder))

@@ -14,35 +14,41 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from experiments.sweep import needed
-from minimax_cal.dynamics.logs.table import Run
+from experiments.sweep import import_optional_module
+from minimax_cal.core.arrays import Array
+from minimax_cal.dynamics.logs.log_table import Run
 from minimax_cal.dynamics.regressor import (
-    Motion,
-    inertial_parameters,
+    JointMotion,
+    build_nominal_inertial_parameters,
+    compute_link_inertial_parameters,
     inverse_dynamics,
-    link_parameters,
 )
-from minimax_cal.ground.arrays import Array
 from minimax_cal.robots.robot import Robot, robot_from_dict
 
-STEP = 0.002  # of the integration [s]
-EVERY = 5  # steps between rows of the log
-RUN_S = (10.0, 10.0, 10.0, 14.0)  # lengths of the runs [s]
-SLOW_PEAK = 0.2  # largest speed of the last run [rad/s]
-BASE_HZ = (0.06, 0.12)  # of the excitation's first harmonic
-HARMONICS = 5
-RATIO = 50.0  # of the gears, which is given
-HUMS = 23.7  # waves a turn of a cogging whose ratio nobody gives
-CARRIED = (1.5, (0.0, 0.0, 0.06))  # known payload of the second run, where there is one [kg], [m]
-BRISTLES = (2e-5, 1e-4)  # way over which friction of a sound arm builds up [rad]
-NOISE = (0.02, 0.05)  # of a torque sample, of the joint's Coulomb friction
-RED, MEMORY = 0.4, 0.95  # a part of the noise that remembers: its size, its correlation in a sample
-ENCODER = 2e-6  # noise of joint values [rad]
-MUJOCO, OWN = "mujoco", "own"
+MOTION_CASE_TIME_STEP = 0.002  # of the integration [s]
+STEPS_PER_LOG_ROW = 5  # steps between rows of the log
+RUN_SECONDS = (10.0, 10.0, 10.0, 14.0)  # lengths of the runs [s]
+MAX_SLOW_RUN_SPEED = 0.2  # largest speed of the last run [rad/s]
+FIRST_HARMONIC_RANGE_HZ = (0.06, 0.12)  # of the excitation's first harmonic
+EXCITATION_HARMONICS = 5
+GIVEN_GEAR_RATIO = 50.0  # of the gears, which is given
+UNKNOWN_COGGING_WAVES = 23.7  # waves a turn of a cogging whose ratio nobody gives
+KNOWN_PAYLOAD = (
+    1.5,
+    (0.0, 0.0, 0.06),
+)  # known payload of the second run, where there is one [kg], [m]
+BRISTLE_TRAVEL_RANGE = (2e-5, 1e-4)  # way over which friction of a sound arm builds up [rad]
+TORQUE_NOISE_RANGE = (0.02, 0.05)  # of a torque sample, of the joint's Coulomb friction
+CORRELATED_NOISE_FRACTION, NOISE_AUTOCORRELATION = (
+    0.4,
+    0.95,
+)  # a part of the noise that remembers: its size, its correlation in a sample
+JOINT_VALUE_NOISE = 2e-6  # noise of joint values [rad]
+MUJOCO_GENERATOR, INTEGRATION_GENERATOR = "mujoco", "own"
 
 
 @dataclass(frozen=True)
-class Case:
+class MotionCase:
     """What is drawn: generator, causes with the numbers of their joints, and the seed."""
 
     condition: str
@@ -52,7 +58,7 @@ class Case:
 
 
 @dataclass(frozen=True, eq=False)
-class Plant:
+class TrueArm:
     """The true arm.
 
     robot: as drawn.  body: (n, 10).  armature, coulomb, viscous, bristles: (n,) of each joint.
@@ -73,11 +79,11 @@ class Plant:
     gain: Array
     zero: Array
     late: float = 0.0
-    more: tuple[Callable[[Motion, Array, Array], Array], ...] = field(default=())
+    more: tuple[Callable[[JointMotion, Array, Array], Array], ...] = field(default=())
 
 
 @dataclass(frozen=True, eq=False)
-class Made:
+class MotionCaseData:
     """Runs of a case, the arm as its file has it, and what a sound arm would show of the same logs.
 
     signal: (m, n) of each run, what the causes add to the torques of the logged motion.  noise: the
@@ -95,7 +101,7 @@ class Made:
 # ---- arms ----------------------------------------------------------------------------------------
 
 
-def some_arm(rng: np.random.Generator) -> Robot:
+def draw_arm(rng: np.random.Generator) -> Robot:
     """A vertical axis, two parallel ones, and in half of the arms a wrist, of random bars."""
     half, wrist = np.pi / 2.0, bool(rng.integers(2))
     upper, fore = rng.uniform(0.3, 0.6, 2)
@@ -118,22 +124,22 @@ def some_arm(rng: np.random.Generator) -> Robot:
     return robot_from_dict({"name": f"{len(joints)} joints", "units": units, "joints": joints})
 
 
-def between(rng: np.random.Generator, low: float, high: float) -> float:
+def draw_log_uniform(rng: np.random.Generator, lowest: float, highest: float) -> float:
     """A size between two, every ratio as likely."""
-    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+    return float(np.exp(rng.uniform(np.log(lowest), np.log(highest))))
 
 
-def sound(rng: np.random.Generator, robot: Robot) -> Plant:
+def build_sound_arm(rng: np.random.Generator, robot: Robot) -> TrueArm:
     """An arm with usual friction and nothing more."""
     n = robot.joints
     fall = np.array([4.0, 4.0, 2.0, 1.0])[:n]
-    return Plant(
+    return TrueArm(
         robot,
-        inertial_parameters(robot),
+        build_nominal_inertial_parameters(robot),
         armature=np.zeros(n),
         coulomb=fall * rng.uniform(0.7, 1.5, n),
         viscous=fall * rng.uniform(0.5, 1.5, n),
-        bristles=np.array([between(rng, *BRISTLES) for _ in range(n)]),
+        bristles=np.array([draw_log_uniform(rng, *BRISTLE_TRAVEL_RANGE) for _ in range(n)]),
         stribeck=np.tile([0.0, 1.0], (n, 1)),
         compliance=np.zeros(n),
         gain=np.ones(n),
@@ -141,39 +147,46 @@ def sound(rng: np.random.Generator, robot: Robot) -> Plant:
     )
 
 
-def off_by(rng: np.random.Generator, robot: Robot) -> Robot:
+def draw_robot_with_wrong_masses(rng: np.random.Generator, robot: Robot) -> Robot:
     """The arm as a file has it whose masses are guesses."""
     mass = robot.mass * rng.uniform(0.75, 1.3, robot.joints)
     return replace(robot, mass=mass, com=robot.com + rng.uniform(-0.03, 0.03, robot.com.shape))
 
 
-def excitation(rng: np.random.Generator, robot: Robot, seconds: float, peak: float) -> Motion:
-    """A finite Fourier series.  peak: largest speed [rad/s], infinite for its own."""
-    rate = 2.0 * np.pi * rng.uniform(*BASE_HZ) * np.arange(1.0, HARMONICS + 1.0)[:, None]
-    size = 0.7 * rng.normal(size=(2, HARMONICS, robot.joints)) / rate * rate[0]
-    motion = series(seconds, np.tile(rate, robot.joints), size)
-    if np.isfinite(peak):
-        motion = series(seconds, rate * peak / np.abs(motion.qd).max(axis=0), size)
+def draw_excitation(
+    rng: np.random.Generator, robot: Robot, seconds: float, peak_speed: float
+) -> JointMotion:
+    """A finite Fourier series.  peak_speed: largest speed [rad/s], infinite for its own."""
+    rate = (
+        2.0
+        * np.pi
+        * rng.uniform(*FIRST_HARMONIC_RANGE_HZ)
+        * np.arange(1.0, EXCITATION_HARMONICS + 1.0)[:, None]
+    )
+    size = 0.7 * rng.normal(size=(2, EXCITATION_HARMONICS, robot.joints)) / rate * rate[0]
+    motion = fourier_motion(seconds, np.tile(rate, robot.joints), size)
+    if np.isfinite(peak_speed):
+        motion = fourier_motion(seconds, rate * peak_speed / np.abs(motion.qd).max(axis=0), size)
     return replace(motion, q=motion.q + np.array([0.0, 0.7, -1.0, 0.0])[: robot.joints])
 
 
-def series(seconds: float, rate: Array, size: Array) -> Motion:
+def fourier_motion(seconds: float, rate: Array, size: Array) -> JointMotion:
     """Sines and cosines.  rate: (h, n) [rad/s].  size: (2, h, n) [rad]."""
-    turn = np.arange(0.0, seconds, STEP)[:, None, None] * rate
+    turn = np.arange(0.0, seconds, MOTION_CASE_TIME_STEP)[:, None, None] * rate
     a, b = size
     sin, cos = np.sin(turn), np.cos(turn)
     q, qd = a * sin + b * cos, rate * (a * cos - b * sin)
-    return Motion(q.sum(axis=1), qd.sum(axis=1), (-(rate**2) * q).sum(axis=1))
+    return JointMotion(q.sum(axis=1), qd.sum(axis=1), (-(rate**2) * q).sum(axis=1))
 
 
 # ---- generators ----------------------------------------------------------------------------------
 
 
-def bristle_friction(plant: Plant, qd: Array) -> Array:
+def lugre_friction(plant: TrueArm, qd: Array) -> Array:
     """(m, n) LuGre friction: bristles that bend along the way [Canudas de Wit et al. 1995]."""
     share, fades = plant.stribeck.T
     height = plant.coulomb * (1.0 - share * (1.0 - np.exp(-((qd / fades) ** 2))))
-    left = np.exp(-np.abs(qd) * STEP * plant.coulomb / height / plant.bristles)
+    left = np.exp(-np.abs(qd) * MOTION_CASE_TIME_STEP * plant.coulomb / height / plant.bristles)
     target, bent = np.sign(qd) * height, np.zeros_like(qd)
     now = target[0]
     for i in range(len(qd)):
@@ -182,17 +195,17 @@ def bristle_friction(plant: Plant, qd: Array) -> Array:
     return np.asarray(bent + plant.viscous * qd)
 
 
-def by_integration(plant: Plant, motion: Motion) -> tuple[Array, Array]:
+def torques_by_integration(plant: TrueArm, motion: JointMotion) -> tuple[Array, Array]:
     """Torque of the body and all torque (m, n), by Newton and Euler and LuGre friction."""
     rigid = inverse_dynamics(plant.robot, motion, plant.body)
-    return rigid, rigid + plant.armature * motion.qdd + bristle_friction(plant, motion.qd)
+    return rigid, rigid + plant.armature * motion.qdd + lugre_friction(plant, motion.qd)
 
 
-def mjcf_of(plant: Plant) -> str:
+def format_mjcf(plant: TrueArm) -> str:
     """The arm for MuJoCo: a link's frame is where the next joint turns."""
     root = ET.Element("mujoco")
     ET.SubElement(root, "compiler", angle="radian")
-    ET.SubElement(root, "option", gravity="0 0 -9.80665", timestep=str(STEP))
+    ET.SubElement(root, "option", gravity="0 0 -9.80665", timestep=str(MOTION_CASE_TIME_STEP))
     parent, place = ET.SubElement(root, "worldbody"), {"pos": "0 0 0", "quat": "1 0 0 0"}
     for j, (a, d, theta, alpha, _) in enumerate(plant.robot.mdh):
         turned, tilted = theta / 2.0, alpha / 2.0
@@ -219,15 +232,15 @@ def mjcf_of(plant: Plant) -> str:
     return ET.tostring(root, encoding="unicode")
 
 
-def by_mujoco(plant: Plant, motion: Motion) -> tuple[Array, Array]:
+def torques_by_mujoco(plant: TrueArm, motion: JointMotion) -> tuple[Array, Array]:
     """Torque of the body and all torque (m, n), by MuJoCo's inverse dynamics.
 
     Friction that falls with the speed or builds up over a way is no element of MuJoCo: it is added.
     """
-    mujoco = needed("mujoco", "sim")
-    own = (plant.stribeck[:, 0] > 0.0) | (plant.bristles > BRISTLES[1])
+    mujoco = import_optional_module("mujoco", "sim")
+    own = (plant.stribeck[:, 0] > 0.0) | (plant.bristles > BRISTLE_TRAVEL_RANGE[1])
     model = mujoco.MjModel.from_xml_string(
-        mjcf_of(replace(plant, coulomb=np.where(own, 0.0, plant.coulomb)))
+        format_mjcf(replace(plant, coulomb=np.where(own, 0.0, plant.coulomb)))
     )
     data, out = mujoco.MjData(model), np.empty_like(motion.q)
     for i in range(len(out)):
@@ -236,88 +249,119 @@ def by_mujoco(plant: Plant, motion: Motion) -> tuple[Array, Array]:
         out[i] = data.qfrc_inverse
     if own.any():
         dry = replace(plant, viscous=np.zeros_like(plant.viscous))
-        out += own * bristle_friction(dry, motion.qd)
+        out += own * lugre_friction(dry, motion.qd)
     return inverse_dynamics(plant.robot, motion, plant.body), out
 
 
-GENERATORS = {MUJOCO: by_mujoco, OWN: by_integration}
+TORQUE_GENERATORS = {
+    MUJOCO_GENERATOR: torques_by_mujoco,
+    INTEGRATION_GENERATOR: torques_by_integration,
+}
 
 
-def logged(plant: Plant, generator: str, motion: Motion, began: float) -> tuple[Motion, Array]:
+def simulate_logged_torques(
+    plant: TrueArm, generator: str, motion: JointMotion, start_seconds: float
+) -> tuple[JointMotion, Array]:
     """The motion and the torques (m, n) that the log of a run has, without noise.
 
-    motion: of the links.  began: when the run did [s].
+    motion: of the links.  start_seconds: when the run did [s].
     """
-    rigid, out = GENERATORS[generator](plant, motion)
+    rigid, out = TORQUE_GENERATORS[generator](plant, motion)
     if plant.compliance.any():  # what is logged is the motor; friction and rotor are on its side
         by = plant.compliance * rigid
-        rate = derivative(by)
-        motion = Motion(motion.q + by, motion.qd + rate, motion.qdd + derivative(rate))
-        body, whole = GENERATORS[generator](plant, motion)
+        rate = time_derivative(by)
+        motion = JointMotion(motion.q + by, motion.qd + rate, motion.qdd + time_derivative(rate))
+        body, whole = TORQUE_GENERATORS[generator](plant, motion)
         out = rigid + whole - body
-    time = STEP * np.arange(len(out))
+    time = MOTION_CASE_TIME_STEP * np.arange(len(out))
     for extra in plant.more:
-        out = out + extra(motion, rigid, began + time)
+        out = out + extra(motion, rigid, start_seconds + time)
     if plant.late:
         out = np.stack([np.interp(time - plant.late, time, column) for column in out.T], axis=1)
     return replace(motion, q=motion.q + plant.zero), out * plant.gain
 
 
-def derivative(values: Array) -> Array:
+def time_derivative(values: Array) -> Array:
     """In time, of values (m, n) at every step."""
-    return np.asarray(np.gradient(values, STEP, axis=0, edge_order=2))
+    return np.asarray(np.gradient(values, MOTION_CASE_TIME_STEP, axis=0, edge_order=2))
 
 
-def make(case: Case) -> Made:
+def simulate_case(case: MotionCase) -> MotionCaseData:
     """The runs of a case."""
     rng = np.random.default_rng(case.seed)
-    arm = some_arm(rng)
-    healthy = sound(rng, arm)
+    arm = draw_arm(rng)
+    healthy = build_sound_arm(rng, arm)
     true = healthy
     for name, joint in case.causes:
-        true = CAUSES[name].put(rng, true, joint % arm.joints)
-    of_masses = any(CAUSES[name].of_masses for name, _ in case.causes)
-    robot = arm if of_masses or rng.integers(2) else off_by(rng, arm)
+        true = ALL_MOTION_CAUSES[name].put(rng, true, joint % arm.joints)
+    of_masses = any(ALL_MOTION_CAUSES[name].of_masses for name, _ in case.causes)
+    robot = arm if of_masses or rng.integers(2) else draw_robot_with_wrong_masses(rng, arm)
     loaded = bool(rng.integers(2)) and not of_masses
     warms = bool(rng.integers(3) == 0) or any(name == "warm_up" for name, _ in case.causes)
-    level = rng.uniform(*NOISE) * healthy.coulomb
+    level = rng.uniform(*TORQUE_NOISE_RANGE) * healthy.coulomb
     runs, signals, noises, began = list[Run](), list[Array](), list[Array](), 0.0
-    for number, seconds in enumerate(RUN_S):
-        slow = number == len(RUN_S) - 1
-        motion = excitation(rng, arm, seconds, SLOW_PEAK if slow else np.inf)
-        carried = CARRIED[0] if loaded and number == 1 else 0.0
-        moved, torque = logged(with_load(true, carried), case.generator, motion, began)
-        _, usual = logged(with_load(healthy, carried), case.generator, moved, began)
-        noise = level * coloured(rng, torque[::EVERY].shape)
-        q = moved.q[::EVERY] + ENCODER * rng.normal(size=noise.shape)
-        time = STEP * EVERY * np.arange(len(q))
+    for number, seconds in enumerate(RUN_SECONDS):
+        slow = number == len(RUN_SECONDS) - 1
+        motion = draw_excitation(rng, arm, seconds, MAX_SLOW_RUN_SPEED if slow else np.inf)
+        carried = KNOWN_PAYLOAD[0] if loaded and number == 1 else 0.0
+        moved, torque = simulate_logged_torques(
+            add_known_payload(true, carried), case.generator, motion, began
+        )
+        _, usual = simulate_logged_torques(
+            add_known_payload(healthy, carried), case.generator, moved, began
+        )
+        noise = level * draw_coloured_noise(rng, torque[::STEPS_PER_LOG_ROW].shape)
+        q = moved.q[::STEPS_PER_LOG_ROW] + JOINT_VALUE_NOISE * rng.normal(size=noise.shape)
+        time = MOTION_CASE_TIME_STEP * STEPS_PER_LOG_ROW * np.arange(len(q))
         name = f"run{number + 1}"
-        runs.append(Run(name, f"{name}.csv", time, q, None, None, torque[::EVERY] + noise, "N m",
-                        payload=carried if loaded else None,
-                        temperature=warmth(began + time) if warms else None))  # fmt: skip
-        signals.append((torque - usual)[::EVERY])
+        runs.append(
+            Run(
+                name,
+                f"{name}.csv",
+                time,
+                q,
+                None,
+                None,
+                torque[::STEPS_PER_LOG_ROW] + noise,
+                "N m",
+                payload=carried if loaded else None,
+                temperature=sensor_temperature(began + time) if warms else None,
+            )
+        )
+        signals.append((torque - usual)[::STEPS_PER_LOG_ROW])
         noises.append(noise)
         began += seconds + 60.0
-    return Made(robot, tuple(runs), tuple(signals), tuple(noises), CARRIED if loaded else None,
-                float(true.body[-1, 0] - healthy.body[-1, 0]))  # fmt: skip
+    return MotionCaseData(
+        robot,
+        tuple(runs),
+        tuple(signals),
+        tuple(noises),
+        KNOWN_PAYLOAD if loaded else None,
+        float(true.body[-1, 0] - healthy.body[-1, 0]),
+    )
 
 
-def coloured(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
+def draw_coloured_noise(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
     """(m, n) noise of unit size, a part of which remembers."""
-    red = np.sqrt(1.0 - MEMORY**2) * rng.normal(size=shape)
+    red = np.sqrt(1.0 - NOISE_AUTOCORRELATION**2) * rng.normal(size=shape)
     for i in range(1, len(red)):
-        red[i] += MEMORY * red[i - 1]
-    return np.asarray(np.sqrt(1.0 - RED**2) * rng.normal(size=shape) + RED * red)
+        red[i] += NOISE_AUTOCORRELATION * red[i - 1]
+    return np.asarray(
+        np.sqrt(1.0 - CORRELATED_NOISE_FRACTION**2) * rng.normal(size=shape)
+        + CORRELATED_NOISE_FRACTION * red
+    )
 
 
-def with_load(plant: Plant, mass: float) -> Plant:
+def add_known_payload(plant: TrueArm, payload_mass: float) -> TrueArm:
     """The arm with a known payload."""
     body = plant.body.copy()
-    body[-1] += link_parameters(mass, np.array(CARRIED[1]), np.zeros(6))
+    body[-1] += compute_link_inertial_parameters(
+        payload_mass, np.array(KNOWN_PAYLOAD[1]), np.zeros(6)
+    )
     return replace(plant, body=body)
 
 
-def warmth(time: Array) -> Array:
+def sensor_temperature(time: Array) -> Array:
     """What a sensor of the arm says [C]."""
     return np.asarray(22.0 + 14.0 * (1.0 - np.exp(-time / 150.0)))
 
@@ -326,7 +370,7 @@ def warmth(time: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class At:
+class JointMotionState:
     """What a law of torque knows of a joint, (m,) along the motion.
 
     size, phase: of the law.  time: since the first run began [s].  load: torque of the rigid body.
@@ -346,41 +390,56 @@ class At:
     fast: Array
 
 
-Law = Callable[[At, At], Array]  # of a joint and the next one, or the first after the last
+TorqueLaw = Callable[
+    [JointMotionState, JointMotionState], Array
+]  # of a joint and the next one, or the first after the last
 
 
 @dataclass(frozen=True)
-class Cause:
+class MotionCause:
     """How an arm is made to have a cause, and whether it shows as masses that are not as given."""
 
-    put: Callable[[np.random.Generator, Plant, int], Plant]
+    put: Callable[[np.random.Generator, TrueArm, int], TrueArm]
     of_masses: bool = False
 
 
-def changed(name: str, low: float, high: float, *, either: bool = False) -> Cause:
+def cause_changing_number(
+    field_name: str, lowest: float, highest: float, *, either_sign: bool = False
+) -> MotionCause:
     """A number of a joint, drawn between two sizes, of either sign if asked."""
 
-    def put(rng: np.random.Generator, plant: Plant, j: int) -> Plant:
-        value = getattr(plant, name).copy()
-        more = between(rng, low, high)
-        value[j] += -more if either and rng.integers(2) else more
-        return replace(plant, **{name: value})
+    def put(rng: np.random.Generator, plant: TrueArm, j: int) -> TrueArm:
+        value = getattr(plant, field_name).copy()
+        more = draw_log_uniform(rng, lowest, highest)
+        value[j] += -more if either_sign and rng.integers(2) else more
+        return replace(plant, **{field_name: value})
 
-    return Cause(put)
+    return MotionCause(put)
 
 
-def added(law: Law, low: float, high: float) -> Cause:
-    """Torque at a joint.  low, high: of its size, which the law takes with a phase."""
+def cause_adding_torque(law: TorqueLaw, lowest: float, highest: float) -> MotionCause:
+    """Torque at a joint.  lowest, highest: of its size, which the law takes with a phase."""
 
-    def put(rng: np.random.Generator, plant: Plant, j: int) -> Plant:
-        size, phase = between(rng, low, high), rng.uniform(-np.pi, np.pi)
+    def put(rng: np.random.Generator, plant: TrueArm, j: int) -> TrueArm:
+        size, phase = draw_log_uniform(rng, lowest, highest), rng.uniform(-np.pi, np.pi)
 
-        def at(j: int, motion: Motion, rigid: Array, time: Array) -> At:
+        def at(j: int, motion: JointMotion, rigid: Array, time: Array) -> JointMotionState:
             q, qd, qdd, load = (of[:, j] for of in (motion.q, motion.qd, motion.qdd, rigid))
-            return At(size, phase, time, plant.coulomb[j], plant.viscous[j], q, qd, qdd, load,
-                      np.tanh(qd / 1e-3), np.abs(qd) / 2.0)  # fmt: skip
+            return JointMotionState(
+                size,
+                phase,
+                time,
+                plant.coulomb[j],
+                plant.viscous[j],
+                q,
+                qd,
+                qdd,
+                load,
+                np.tanh(qd / 1e-3),
+                np.abs(qd) / 2.0,
+            )
 
-        def extra(motion: Motion, rigid: Array, time: Array) -> Array:
+        def extra(motion: JointMotion, rigid: Array, time: Array) -> Array:
             out = np.zeros_like(rigid)
             beside = (j + 1) % out.shape[1]
             out[:, j] = law(*(at(k, motion, rigid, time) for k in (j, beside)))
@@ -388,123 +447,163 @@ def added(law: Law, low: float, high: float) -> Cause:
 
         return replace(plant, more=(*plant.more, extra))
 
-    return Cause(put)
+    return MotionCause(put)
 
 
-def bristly(rng: np.random.Generator, plant: Plant, j: int) -> Plant:
+def set_long_bristle_travel(
+    rng: np.random.Generator, true_arm: TrueArm, joint_index: int
+) -> TrueArm:
     """Friction that builds up over a way that is seen."""
-    way = plant.bristles.copy()
-    way[j] = between(rng, 0.005, 0.05)
-    return replace(plant, bristles=way)
+    way = true_arm.bristles.copy()
+    way[joint_index] = draw_log_uniform(rng, 0.005, 0.05)
+    return replace(true_arm, bristles=way)
 
 
-def falling(rng: np.random.Generator, plant: Plant, j: int) -> Plant:
+def set_stribeck_friction(rng: np.random.Generator, true_arm: TrueArm, joint_index: int) -> TrueArm:
     """Friction that falls from rest with the speed; above it, it is as usual."""
-    peak, stribeck = rng.uniform(0.3, 1.0), plant.stribeck.copy()
-    coulomb = plant.coulomb.copy()
-    coulomb[j] *= 1.0 + peak
-    stribeck[j] = peak / (1.0 + peak), between(rng, 0.05, 0.3)
-    return replace(plant, coulomb=coulomb, stribeck=stribeck)
+    peak, stribeck = rng.uniform(0.3, 1.0), true_arm.stribeck.copy()
+    coulomb = true_arm.coulomb.copy()
+    coulomb[joint_index] *= 1.0 + peak
+    stribeck[joint_index] = peak / (1.0 + peak), draw_log_uniform(rng, 0.05, 0.3)
+    return replace(true_arm, coulomb=coulomb, stribeck=stribeck)
 
 
-def lasting(rng: np.random.Generator, plant: Plant, j: int) -> Plant:
+def set_torque_delay(rng: np.random.Generator, true_arm: TrueArm, joint_index: int) -> TrueArm:
     """Torques that are logged late."""
-    return replace(plant, late=between(rng, 0.002, 0.012))
+    return replace(true_arm, late=draw_log_uniform(rng, 0.002, 0.012))
 
 
-def carrying(rng: np.random.Generator, plant: Plant, j: int) -> Plant:
+def add_unknown_payload(rng: np.random.Generator, true_arm: TrueArm, joint_index: int) -> TrueArm:
     """A payload that nobody told."""
-    mass, at = between(rng, 0.3, 3.0), rng.uniform(-0.05, 0.05, 3)
-    body = plant.body.copy()
+    mass, at = draw_log_uniform(rng, 0.3, 3.0), rng.uniform(-0.05, 0.05, 3)
+    body = true_arm.body.copy()
     at[2] += 0.05
-    body[-1] += link_parameters(mass, at, np.array([1e-3, 0.0, 0.0, 1e-3, 0.0, 1e-3]))
-    return replace(plant, body=body)
+    body[-1] += compute_link_inertial_parameters(
+        mass, at, np.array([1e-3, 0.0, 0.0, 1e-3, 0.0, 1e-3])
+    )
+    return replace(true_arm, body=body)
 
 
-def heavier(rng: np.random.Generator, plant: Plant, j: int) -> Plant:
+def add_link_mass(rng: np.random.Generator, true_arm: TrueArm, joint_index: int) -> TrueArm:
     """A link that is heavier than drawn, by a mass beside its own centre."""
-    j, body = max(j, 1) if len(plant.body) > 2 else j, plant.body.copy()
-    j = min(j, len(body) - 2)
-    more = rng.uniform(0.1, 0.4) * body[j, 0]
-    at = body[j, 1:4] / body[j, 0] + rng.uniform(-0.08, 0.08, 3)
-    body[j] += link_parameters(more, at, np.zeros(6))
-    return replace(plant, body=body)
+    joint_index, body = (
+        max(joint_index, 1) if len(true_arm.body) > 2 else joint_index,
+        true_arm.body.copy(),
+    )
+    joint_index = min(joint_index, len(body) - 2)
+    more = rng.uniform(0.1, 0.4) * body[joint_index, 0]
+    at = body[joint_index, 1:4] / body[joint_index, 0] + rng.uniform(-0.08, 0.08, 3)
+    body[joint_index] += compute_link_inertial_parameters(more, at, np.zeros(6))
+    return replace(true_arm, body=body)
 
 
-def relaxed(drive: Array, seconds: float) -> Array:
+def first_order_lag(drive: Array, seconds: float) -> Array:
     """(m,) a drive that is followed late, to the first order."""
-    out, left, now = np.empty_like(drive), np.exp(-STEP / seconds), 0.0
+    out, left, now = np.empty_like(drive), np.exp(-MOTION_CASE_TIME_STEP / seconds), 0.0
     for i, value in enumerate(drive):
         now = value + (now - value) * left
         out[i] = now
     return out
 
 
-def hysteresis(q: Array, way: float) -> Array:
+def slider_spring_hysteresis(q: Array, slip_travel: float) -> Array:
     """(m,) a spring in series with a slider: it lags the angle, and remembers where it turned."""
     out, now = np.empty_like(q), 0.0
     for i in range(1, len(q)):
-        now = float(np.clip(now + q[i] - q[i - 1], -way, way))
+        now = float(np.clip(now + q[i] - q[i - 1], -slip_travel, slip_travel))
         out[i] = now
     out[0] = 0.0
-    return out / way
+    return out / slip_travel
 
 
-def sloshing(drive: Array, rate: float) -> Array:
+def sloshing_mass_force(drive: Array, natural_frequency: float) -> Array:
     """(m,) the force of a mass on a spring of that rate [rad/s], a tenth damped, on its holder."""
     out, x, v = np.empty_like(drive), 0.0, 0.0
     for i, value in enumerate(drive):
-        v += STEP * (-value - 0.2 * rate * v - rate**2 * x)
-        x += STEP * v
-        out[i] = rate**2 * x
+        v += MOTION_CASE_TIME_STEP * (
+            -value - 0.2 * natural_frequency * v - natural_frequency**2 * x
+        )
+        x += MOTION_CASE_TIME_STEP * v
+        out[i] = natural_frequency**2 * x
     return out
 
 
-LIBRARY: Mapping[str, Cause] = {
-    "degressive": added(lambda a, b: a.size * a.coulomb * a.slip
-                        * a.fast ** (0.45 + 0.15 * np.sin(a.phase)), 0.4, 2.0),
-    "stribeck": Cause(falling),
-    "presliding": Cause(bristly),
-    "asymmetry": added(lambda a, b: a.size * a.coulomb * np.sign(a.phase) * a.fast, 0.15, 0.6),
-    "load_friction": added(lambda a, b: a.size * np.abs(a.load) * a.slip, 0.03, 0.12),
-    "angle_friction": added(
-        lambda a, b: a.size * a.coulomb * a.slip * np.cos(a.q - a.phase), 0.15, 0.6),
-    "warm_up": added(
-        lambda a, b: a.size * a.coulomb * a.slip * (36.0 - warmth(a.time)) / 14.0, 0.2, 0.7),
-    "armature": changed("armature", 0.05, 0.5),
-    "drive_gain": changed("gain", 0.02, 0.08, either=True),
-    "torque_offset": added(
-        lambda a, b: a.size * a.coulomb * np.sign(a.phase) * np.ones_like(a.time), 0.15, 1.0),
-    "torque_ripple": added(
-        lambda a, b: a.size * a.coulomb * np.cos(RATIO * a.q - a.phase), 0.1, 0.5),
-    "cable": added(lambda a, b: a.size * a.coulomb * (a.q - 0.3 * a.phase), 0.15, 1.0),
-    "gravity_spring": added(
-        lambda a, b: a.size * a.coulomb * np.sin(2.0 * a.q - a.phase), 0.15, 1.0),
-    "payload": Cause(carrying, of_masses=True),
-    "link_inertia": Cause(heavier, of_masses=True),
-    "joint_flexibility": changed("compliance", 5e-5, 1e-3),
-    "delay": Cause(lasting),
-    "encoder_zero": changed("zero", 0.003, 0.03, either=True),
-}  # fmt: skip
-OUTSIDE: Mapping[str, Cause] = {
-    "friction that recent motion lowers": added(
-        lambda a, b: -a.size * a.coulomb * a.slip * relaxed(a.fast, 3.0), 0.5, 2.0),
-    "damping by another joint's angle": added(
-        lambda a, b: a.size * a.viscous * a.qd * np.cos(b.q - a.phase), 0.3, 1.0),
-    "hysteretic cable": added(
-        lambda a, b: a.size * a.coulomb * hysteresis(a.q, 0.4), 0.3, 1.0),
-    "torque step at a moment": added(lambda a, b: a.size * a.coulomb * np.sign(a.phase)
-                                     * (a.time > 70.0 + np.abs(a.phase)), 0.3, 1.0),
-    "temperature wave": added(
-        lambda a, b: a.size * a.coulomb * a.slip * np.sin(a.time / 5.0 + a.phase), 0.2, 0.8),
-    "cogging of no given ratio": added(
-        lambda a, b: a.size * a.coulomb * np.cos(HUMS * a.q - a.phase), 0.15, 0.6),
-    "sloshing load": added(lambda a, b: a.size * sloshing(a.qdd, 9.0), 0.1, 0.6),
-    "friction of another joint": added(lambda a, b: a.size * a.coulomb * b.slip, 0.2, 0.7),
-    "friction by another joint's load": added(
-        lambda a, b: a.size * a.coulomb * a.slip
-        * np.tanh(b.load / max(np.abs(b.load).mean(), 1e-9)), 0.3, 1.0),
-    "drag by the square of the speed": added(
-        lambda a, b: a.size * a.coulomb * a.qd * a.fast, 0.4, 2.0),
-}  # fmt: skip
-CAUSES: Mapping[str, Cause] = {**LIBRARY, **OUTSIDE}
+LIBRARY_MOTION_CAUSES: Mapping[str, MotionCause] = {
+    "degressive": cause_adding_torque(
+        lambda a, b: a.size * a.coulomb * a.slip * a.fast ** (0.45 + 0.15 * np.sin(a.phase)),
+        0.4,
+        2.0,
+    ),
+    "stribeck": MotionCause(set_stribeck_friction),
+    "presliding": MotionCause(set_long_bristle_travel),
+    "asymmetry": cause_adding_torque(
+        lambda a, b: a.size * a.coulomb * np.sign(a.phase) * a.fast, 0.15, 0.6
+    ),
+    "load_friction": cause_adding_torque(lambda a, b: a.size * np.abs(a.load) * a.slip, 0.03, 0.12),
+    "angle_friction": cause_adding_torque(
+        lambda a, b: a.size * a.coulomb * a.slip * np.cos(a.q - a.phase), 0.15, 0.6
+    ),
+    "warm_up": cause_adding_torque(
+        lambda a, b: a.size * a.coulomb * a.slip * (36.0 - sensor_temperature(a.time)) / 14.0,
+        0.2,
+        0.7,
+    ),
+    "armature": cause_changing_number("armature", 0.05, 0.5),
+    "drive_gain": cause_changing_number("gain", 0.02, 0.08, either_sign=True),
+    "torque_offset": cause_adding_torque(
+        lambda a, b: a.size * a.coulomb * np.sign(a.phase) * np.ones_like(a.time), 0.15, 1.0
+    ),
+    "torque_ripple": cause_adding_torque(
+        lambda a, b: a.size * a.coulomb * np.cos(GIVEN_GEAR_RATIO * a.q - a.phase), 0.1, 0.5
+    ),
+    "cable": cause_adding_torque(
+        lambda a, b: a.size * a.coulomb * (a.q - 0.3 * a.phase), 0.15, 1.0
+    ),
+    "gravity_spring": cause_adding_torque(
+        lambda a, b: a.size * a.coulomb * np.sin(2.0 * a.q - a.phase), 0.15, 1.0
+    ),
+    "payload": MotionCause(add_unknown_payload, of_masses=True),
+    "link_inertia": MotionCause(add_link_mass, of_masses=True),
+    "joint_flexibility": cause_changing_number("compliance", 5e-5, 1e-3),
+    "delay": MotionCause(set_torque_delay),
+    "encoder_zero": cause_changing_number("zero", 0.003, 0.03, either_sign=True),
+}
+OUTSIDE_MOTION_CAUSES: Mapping[str, MotionCause] = {
+    "friction that recent motion lowers": cause_adding_torque(
+        lambda a, b: -a.size * a.coulomb * a.slip * first_order_lag(a.fast, 3.0), 0.5, 2.0
+    ),
+    "damping by another joint's angle": cause_adding_torque(
+        lambda a, b: a.size * a.viscous * a.qd * np.cos(b.q - a.phase), 0.3, 1.0
+    ),
+    "hysteretic cable": cause_adding_torque(
+        lambda a, b: a.size * a.coulomb * slider_spring_hysteresis(a.q, 0.4), 0.3, 1.0
+    ),
+    "torque step at a moment": cause_adding_torque(
+        lambda a, b: a.size * a.coulomb * np.sign(a.phase) * (a.time > 70.0 + np.abs(a.phase)),
+        0.3,
+        1.0,
+    ),
+    "temperature wave": cause_adding_torque(
+        lambda a, b: a.size * a.coulomb * a.slip * np.sin(a.time / 5.0 + a.phase), 0.2, 0.8
+    ),
+    "cogging of no given ratio": cause_adding_torque(
+        lambda a, b: a.size * a.coulomb * np.cos(UNKNOWN_COGGING_WAVES * a.q - a.phase), 0.15, 0.6
+    ),
+    "sloshing load": cause_adding_torque(
+        lambda a, b: a.size * sloshing_mass_force(a.qdd, 9.0), 0.1, 0.6
+    ),
+    "friction of another joint": cause_adding_torque(
+        lambda a, b: a.size * a.coulomb * b.slip, 0.2, 0.7
+    ),
+    "friction by another joint's load": cause_adding_torque(
+        lambda a, b: (
+            a.size * a.coulomb * a.slip * np.tanh(b.load / max(np.abs(b.load).mean(), 1e-9))
+        ),
+        0.3,
+        1.0,
+    ),
+    "drag by the square of the speed": cause_adding_torque(
+        lambda a, b: a.size * a.coulomb * a.qd * a.fast, 0.4, 2.0
+    ),
+}
+ALL_MOTION_CAUSES: Mapping[str, MotionCause] = {**LIBRARY_MOTION_CAUSES, **OUTSIDE_MOTION_CAUSES}

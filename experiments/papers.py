@@ -31,54 +31,61 @@ from experiments import (
     warm_start,
 )
 from experiments.sweep import Study, study_options
-from experiments.verdicts import HEADER, MISSING, Verdict, table_of
-from minimax_cal.ground.files import write_whole
+from experiments.verdicts import (
+    NOT_COVERED_VERDICT,
+    VERDICT_COLUMNS,
+    PaperVerdict,
+    build_verdicts_table,
+)
+from minimax_cal.core.files import write_file_atomically
 
-Judged = Callable[[Any], Iterable[Verdict]]
+JudgeResults = Callable[[Any], Iterable[PaperVerdict]]
 
 
-def verdicts_of(
-    study: Study, module: ModuleType, judged: Judged, **options: int
-) -> Iterable[Verdict]:
+def run_and_judge_study(
+    study: Study, module: ModuleType, judge_results: JudgeResults, **options: int
+) -> Iterable[PaperVerdict]:
     """Run one of the studies into a folder of its own, and judge what it found."""
     name = module.__name__.rpartition(".")[2]
     own = replace(study, name=name, out=study.out / name, json=None)
-    found = module.study_of(own, **options)
-    module.save(own, found)
-    return judged(found)
+    found = module.run_all_cases(own, **options)
+    module.save_results(own, found)
+    return judge_results(found)
 
 
-def study_of(study: Study, every: int = 1) -> list[Verdict]:
-    """All verdicts, paper S first.  every: of the starts of Table 2."""
-    of = partial(verdicts_of, study)
+def collect_all_verdicts(study: Study, stride: int = 1) -> list[PaperVerdict]:
+    """All verdicts, paper S first.  stride: of the starts of Table 2."""
+    of = partial(run_and_judge_study, study)
     verdicts = [
-        *verdicts_s.model(),
-        *of(convergence, verdicts_s.table_2, every=every),
-        *of(courses, verdicts_s.courses),
-        *of(any_base, verdicts_s.anywhere),
-        *verdicts_s.own_cell(),
-        *of(methods, verdicts_m.tables_1_4),
-        *of(conditions, verdicts_m.conditions),
-        *of(splits, verdicts_m.many_splits),
-        *of(warm_start, verdicts_m.warm_starts),
-        *of(algorithm_1, verdicts_m.to_the_letter),
-        *verdicts_m.subproblems(study.quick),
-        *verdicts_m.own_cell(),
-        *of(errata, verdicts_m.slips),
+        *verdicts_s.judge_model_equations(),
+        *of(convergence, verdicts_s.judge_table_2, stride=stride),
+        *of(courses, verdicts_s.judge_courses),
+        *of(any_base, verdicts_s.judge_any_base),
+        *verdicts_s.list_uncovered_items(),
+        *of(methods, verdicts_m.judge_tables_1_and_4),
+        *of(conditions, verdicts_m.judge_conditions),
+        *of(splits, verdicts_m.judge_splits),
+        *of(warm_start, verdicts_m.judge_warm_starts),
+        *of(algorithm_1, verdicts_m.judge_algorithm_1),
+        *verdicts_m.judge_subgradient_method(study.quick),
+        *verdicts_m.list_uncovered_items(),
+        *of(errata, verdicts_m.judge_errata),
     ]
     return [replace(verdict, quick=study.quick) for verdict in verdicts]
 
 
 @study_options("papers")
-@convergence.every_start
+@convergence.stride_option
 def main(study: Study, every: int) -> None:
     """Every table and figure of the two papers, and a table of verdicts."""
-    verdicts = study_of(study, every)
-    table = table_of(verdicts)
+    verdicts = collect_all_verdicts(study, every)
+    table = build_verdicts_table(verdicts)
     content = {
-        "verdicts": table.records(*HEADER),
+        "verdicts": table.to_records(*VERDICT_COLUMNS),
         "count": dict(Counter(verdict.verdict for verdict in verdicts)),
-        "not_covered": [verdict.remark for verdict in verdicts if verdict.verdict == MISSING],
+        "not_covered": [
+            verdict.remark for verdict in verdicts if verdict.verdict == NOT_COVERED_VERDICT
+        ],
     }
     study.save([table], content)
-    write_whole(study.out / "verdicts.csv", table.csv())
+    write_file_atomically(study.out / "verdicts.csv", table.csv())

@@ -15,53 +15,68 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
-from experiments.real import off_drawing
+from experiments.real_arms import perturb_link_parameters
+from minimax_cal.core.arrays import Array
+from minimax_cal.fitting.multi_instrument.instrument_stack import build_own_state
 from minimax_cal.fitting.pixels.fit import PixelSquares
-from minimax_cal.fitting.pixels.judge import POSES as JUDGED
-from minimax_cal.fitting.pixels.judge import everywhere, free_motion, missed, tool_points
-from minimax_cal.fitting.several.stack import own_state
-from minimax_cal.ground.arrays import Array
-from minimax_cal.instruments.camera import Camera
-from minimax_cal.instruments.images import Images
-from minimax_cal.instruments.pixels import PixelData
+from minimax_cal.fitting.pixels.pixel_uncertainty import JUDGED_POSE_COUNT as JUDGED
+from minimax_cal.fitting.pixels.pixel_uncertainty import (
+    sample_joint_range,
+    tool_motion_without_rigid,
+    tool_position_rms_error,
+    tool_positions,
+)
+from minimax_cal.instruments.camera_images import CameraImages
+from minimax_cal.instruments.camera_model import Camera
+from minimax_cal.instruments.pixel_data import PixelData
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.robots import kinematics
-from minimax_cal.robots.gravity import masses_of, torques
-from minimax_cal.robots.sampling import random_joints
-from minimax_cal.robots.transforms import transform
-from minimax_cal.solvers.least_squares import solve_normal
+from minimax_cal.robots.gravity_torques import joint_gravity_torques, link_masses_and_centres
+from minimax_cal.robots.joint_sampling import random_joint_values
+from minimax_cal.robots.transforms import build_transform
+from minimax_cal.solvers.least_squares import solve_normal_equations
 
-SIZE = (2448, 2048)  # five megapixels
-LENS = (2500.0, 2500.0, 1223.5, 1023.5)
-BARREL = (-0.12, 0.08, 2e-4, -3e-4, 0.0)
-BOARD, SQUARE = (11, 8), 0.025  # corners, and their distance [m]
-NOISE = 0.106  # of u and v [px]: 0.15 px together
-OFF_LENGTH, OFF_ANGLE = 0.5e-3, 1e-3  # of each link parameter [m, rad]
-DISTANCE, TILT = (0.35, 0.75), 0.7  # of cameras from the board, and to its normal [m], [rad]
-MARGIN = 20.0  # from the edge of the image [px]
-POSES = 1000  # that an arm is judged by
-GEARS = 3e-4  # error of a gear once a turn, half of it twice a turn [rad]
-SPRINGS = np.array([0.0, 1.0, 1.0, 0.5, 0.0, 0.0]) * 1e-5  # bending of the joints [rad/Nm]
-ALL_OVER, WITHIN = 1.5, 0.05  # joints about a middle where poses are sought [rad]
-ASIDE = np.array([0.3, -1.2, 1.2, -1.0, -1.5, 0.3])  # the middle of poses to one side [rad]
-Law = Callable[[Array], Array]
+IMAGE_SIZE_PX = (2448, 2048)  # five megapixels
+LENS_PARAMETERS_PX = (2500.0, 2500.0, 1223.5, 1023.5)
+LENS_DISTORTION = (-0.12, 0.08, 2e-4, -3e-4, 0.0)
+BOARD_CORNER_COUNTS, BOARD_SQUARE = (11, 8), 0.025  # corners, and their distance [m]
+PIXEL_NOISE = 0.106  # of u and v [px]: 0.15 px together
+LINK_LENGTH_ERROR_SIGMA, LINK_ANGLE_ERROR_SIGMA = 0.5e-3, 1e-3  # of each link parameter [m, rad]
+CAMERA_DISTANCE_RANGE, MAX_CAMERA_TILT = (
+    (0.35, 0.75),
+    0.7,
+)  # of cameras from the board, and to its normal [m], [rad]
+IMAGE_MARGIN_PX = 20.0  # from the edge of the image [px]
+ARM_ERROR_POSES = 1000  # that an arm is judged by
+GEAR_ERROR_AMPLITUDE = 3e-4  # error of a gear once a turn, half of it twice a turn [rad]
+JOINT_COMPLIANCES = (
+    np.array([0.0, 1.0, 1.0, 0.5, 0.0, 0.0]) * 1e-5
+)  # bending of the joints [rad/Nm]
+WIDE_POSE_HALF_RANGE, NARROW_POSE_HALF_RANGE = (
+    1.5,
+    0.05,
+)  # joints about a middle where poses are sought [rad]
+ONE_SIDED_POSE_CENTRE = np.array(
+    [0.3, -1.2, 1.2, -1.0, -1.5, 0.3]
+)  # the middle of poses to one side [rad]
+TrueJointLaw = Callable[[Array], Array]
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class SimulatedCamera:
     """A camera: where it is in what it is fixed to, and its lens.
 
     pose: (4, 4) [m].  lens: fx, fy, cx, cy [px].  distortion: (5,).
     """
 
     pose: Array
-    lens: tuple[float, float, float, float] = LENS
-    distortion: tuple[float, ...] = BARREL
-    size: tuple[int, int] = SIZE
+    lens: tuple[float, float, float, float] = LENS_PARAMETERS_PX
+    distortion: tuple[float, ...] = LENS_DISTORTION
+    size: tuple[int, int] = IMAGE_SIZE_PX
 
 
 @dataclass(frozen=True, eq=False)
-class Cell:
+class PixelCell:
     """drawn, true: the arm.  q: (m, n).  points: (k, 3) targets in their own frame [m].
 
     place: (4, 4) of that frame in the base or on the flange.  pixel: (c, m, k, 2) [px], NaN where
@@ -71,112 +86,133 @@ class Cell:
     drawn: mc.Robot
     true: mc.Robot
     on_flange: bool
-    views: tuple[View, ...]
+    views: tuple[SimulatedCamera, ...]
     points: Array
     place: Array
     q: Array
     pixel: Array
     names: tuple[str, ...] = field(default_factory=tuple)
-    law: Law = np.asarray
+    law: TrueJointLaw = np.asarray
 
 
-def board_points(corners: tuple[int, int] = BOARD, square: float = SQUARE) -> Array:
+def board_corner_points(
+    corner_counts: tuple[int, int] = BOARD_CORNER_COUNTS, square_size: float = BOARD_SQUARE
+) -> Array:
     """(k, 3) corners of a board about its middle [m]."""
-    x, y = np.meshgrid(np.arange(corners[0]), np.arange(corners[1]))
-    flat = square * np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    x, y = np.meshgrid(np.arange(corner_counts[0]), np.arange(corner_counts[1]))
+    flat = square_size * np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
     return np.asarray(flat - flat.mean(axis=0))
 
 
-def projected(view: View, point: Array) -> Array:
+def project_points(camera: SimulatedCamera, points: Array) -> Array:
     """Pixels (..., 2) of points (..., 3) in the camera's axes; NaN outside the image."""
-    fx, fy, cx, cy = view.lens
-    k1, k2, p1, p2, k3 = view.distortion
+    fx, fy, cx, cy = camera.lens
+    k1, k2, p1, p2, k3 = camera.distortion
     with np.errstate(divide="ignore", invalid="ignore"):
-        x, y = point[..., 0] / point[..., 2], point[..., 1] / point[..., 2]
+        x, y = points[..., 0] / points[..., 2], points[..., 1] / points[..., 2]
         r2 = x**2 + y**2
         radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
         u = fx * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2)) + cx
         v = fy * (y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y) + cy
     pixel = np.stack([u, v], axis=-1)
-    seen = (point[..., 2] > 0.05) & (r2 < 0.6)
-    seen &= ((pixel >= MARGIN) & (pixel <= np.array(view.size) - MARGIN)).all(axis=-1)
+    seen = (points[..., 2] > 0.05) & (r2 < 0.6)
+    seen &= ((pixel >= IMAGE_MARGIN_PX) & (pixel <= np.array(camera.size) - IMAGE_MARGIN_PX)).all(
+        axis=-1
+    )
     return np.where(seen[..., None], pixel, np.nan)
 
 
-def seen_by(view: View, robot: mc.Robot, q: Array, points: Array, on_flange: bool) -> Array:
+def pixels_of_targets(
+    simulated_camera: SimulatedCamera, robot: mc.Robot, q: Array, points: Array, on_flange: bool
+) -> Array:
     """Pixels (m, k, 2) of targets (k, 3), which stand in the base or ride on the flange."""
     flange = robot.pose(q)
-    camera = flange @ view.pose if on_flange else np.broadcast_to(view.pose, flange.shape)
+    camera = (
+        flange @ simulated_camera.pose
+        if on_flange
+        else np.broadcast_to(simulated_camera.pose, flange.shape)
+    )
     own = np.broadcast_to(np.eye(4), flange.shape) if on_flange else flange
     world = np.einsum("mij,kj->mki", own[:, :3, :3], points) + own[:, None, :3, 3]
     local = np.einsum("mji,mkj->mki", camera[:, :3, :3], world - camera[:, None, :3, 3])
-    return projected(view, local)
+    return project_points(simulated_camera, local)
 
 
-def looking(rng: np.random.Generator, distance: tuple[float, float], tilt: float) -> Array:
+def draw_camera_pose(
+    rng: np.random.Generator, distance_range: tuple[float, float], max_tilt: float
+) -> Array:
     """(4, 4) a camera that looks at the origin from above, more or less, rolled anyhow."""
-    away = rng.uniform(*distance)
+    away = rng.uniform(*distance_range)
     turn = Rotation.from_euler(
-        "zxz", [rng.uniform(0, 2 * np.pi), np.pi - rng.uniform(0, tilt), rng.uniform(0, 2 * np.pi)]
+        "zxz",
+        [rng.uniform(0, 2 * np.pi), np.pi - rng.uniform(0, max_tilt), rng.uniform(0, 2 * np.pi)],
     ).as_matrix()
     aim = rng.normal(size=3) * 0.03
-    return transform(turn, aim - away * turn[:, 2])
+    return build_transform(turn, aim - away * turn[:, 2])
 
 
-def geared(rng: np.random.Generator) -> Law:
+def draw_gear_error_law(rng: np.random.Generator) -> TrueJointLaw:
     """Errors of six gears, once and twice a turn."""
-    size = GEARS * rng.uniform(0.5, 1.5, (2, 6)) * [[1.0], [0.5]]
+    size = GEAR_ERROR_AMPLITUDE * rng.uniform(0.5, 1.5, (2, 6)) * [[1.0], [0.5]]
     phase = rng.uniform(0.0, 2.0 * np.pi, (2, 6))
     return lambda q: q + size[0] * np.sin(q + phase[0]) + size[1] * np.sin(2.0 * q + phase[1])
 
 
-def bent(robot: mc.Robot, rng: np.random.Generator) -> Law:
+def draw_compliance_law(robot: mc.Robot, rng: np.random.Generator) -> TrueJointLaw:
     """Joints that are compliant under gravity."""
-    spring = SPRINGS * rng.uniform(0.5, 1.5, 6)
+    spring = JOINT_COMPLIANCES * rng.uniform(0.5, 1.5, 6)
 
     def law(q: Array) -> Array:
-        links = kinematics.chain(robot.mdh, robot.turned(q), robot.prismatic)
-        return np.asarray(q + spring * torques(links, *masses_of(robot), robot.up).T)
+        links = kinematics.compute_link_frames(
+            robot.mdh, robot.chain_joint_values(q), robot.prismatic
+        )
+        return np.asarray(
+            q + spring * joint_gravity_torques(links, *link_masses_and_centres(robot), robot.up).T
+        )
 
     return law
 
 
-def make_cell(
+def simulate_pixel_cell(
     rng: np.random.Generator,
     *,
     robot: str = "ur5",
-    poses: int = 60,
+    pose_count: int = 60,
     on_flange: bool = True,
-    views: Sequence[View] = (),
-    points: Array | None = None,
-    noise: float = NOISE,
-    distance: tuple[float, float] = DISTANCE,
-    tilt: float = TILT,
-    off: tuple[float, float] = (OFF_LENGTH, OFF_ANGLE),
-    least: float = 0.6,
-    law: Law = np.asarray,
-    aside: bool = False,
-) -> Cell:
+    views: Sequence[SimulatedCamera] = (),
+    target_points: Array | None = None,
+    noise: float = PIXEL_NOISE,
+    distance: tuple[float, float] = CAMERA_DISTANCE_RANGE,
+    tilt: float = MAX_CAMERA_TILT,
+    link_error_sigmas: tuple[float, float] = (LINK_LENGTH_ERROR_SIGMA, LINK_ANGLE_ERROR_SIGMA),
+    min_visible_share: float = 0.6,
+    true_joint_law: TrueJointLaw = np.asarray,
+    one_sided: bool = False,
+) -> PixelCell:
     """A cell: poses where every camera sees most of the targets.
 
-    distance: of the camera from the targets [m].  off: of the arm's links from their drawing [m,
-    rad].  least: share of the targets in an image.  law: where the joints truly are.  aside:
-    whether all poses are to one side.
+    distance: of the camera from the targets [m].  link_error_sigmas: of the arm's links from their
+    drawing [m, rad].  min_visible_share: share of the targets in an image.  true_joint_law: where
+    the joints truly are.  one_sided: whether all poses are to one side.
     """
     drawn = mc.load_robot(robot)
-    true = off_drawing(drawn, rng, *off)
-    points = board_points() if points is None else points
-    mounted = transform(Rotation.from_euler("xyz", rng.uniform(-0.3, 0.3, 3)).as_matrix(),
+    true = perturb_link_parameters(drawn, rng, *link_error_sigmas)
+    target_points = board_corner_points() if target_points is None else target_points
+    mounted = build_transform(Rotation.from_euler("xyz", rng.uniform(-0.3, 0.3, 3)).as_matrix(),
                         np.array([0.04, -0.03, 0.08]))  # fmt: skip
-    stands = transform(Rotation.from_euler("xyz", rng.uniform(-0.2, 0.2, 3)).as_matrix(),
+    stands = build_transform(Rotation.from_euler("xyz", rng.uniform(-0.2, 0.2, 3)).as_matrix(),
                        np.array([0.5 * drawn.reach(), 0.1, 0.05]))  # fmt: skip
-    views = tuple(views) or (View(mounted if on_flange else stands),)
+    views = tuple(views) or (SimulatedCamera(mounted if on_flange else stands),)
     place = stands if on_flange else mounted
-    away, middle = (WITHIN, ASIDE) if aside else (ALL_OVER, np.zeros(drawn.joints))
+    away, middle = (
+        (NARROW_POSE_HALF_RANGE, ONE_SIDED_POSE_CENTRE)
+        if one_sided
+        else (WIDE_POSE_HALF_RANGE, np.zeros(drawn.joints))
+    )
     q = np.zeros((0, drawn.joints))
-    world = points @ place[:3, :3].T + place[:3, 3]
-    while len(q) < poses:
-        relative = np.stack([looking(rng, distance, tilt) for _ in range(poses)])
+    world = target_points @ place[:3, :3].T + place[:3, 3]
+    while len(q) < pose_count:
+        relative = np.stack([draw_camera_pose(rng, distance, tilt) for _ in range(pose_count)])
         if on_flange:
             goal = place @ relative @ np.linalg.inv(views[0].pose)
         else:
@@ -184,28 +220,37 @@ def make_cell(
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             found = drawn.inverse(
-                goal, near=rng.uniform(-away, away, (poses, drawn.joints)) + middle
+                goal, near=rng.uniform(-away, away, (pose_count, drawn.joints)) + middle
             )
         found = (found + np.pi) % (2 * np.pi) - np.pi
-        seen = (seen_by(view, true, law(found), world, on_flange) for view in views)
+        seen = (
+            pixels_of_targets(view, true, true_joint_law(found), world, on_flange) for view in views
+        )
         share = np.mean([np.isfinite(each[..., 0]).mean(axis=1) for each in seen], axis=0)
-        q = np.concatenate([q, found[share >= least]])
-    names = tuple(f"c{i}" for i in range(len(points)))
-    none = np.zeros((len(views), 0, len(points), 2))
-    cell = Cell(drawn, true, on_flange, views, points, place, q[:0], none, names, law)
-    return taken(cell, q[:poses], rng, noise)
+        q = np.concatenate([q, found[share >= min_visible_share]])
+    names = tuple(f"c{i}" for i in range(len(target_points)))
+    none = np.zeros((len(views), 0, len(target_points), 2))
+    cell = PixelCell(
+        drawn, true, on_flange, views, target_points, place, q[:0], none, names, true_joint_law
+    )
+    return cell_at_joint_values(cell, q[:pose_count], rng, noise)
 
 
-def taken(cell: Cell, q: Array, rng: np.random.Generator, noise: float = NOISE) -> Cell:
+def cell_at_joint_values(
+    cell: PixelCell, q: Array, rng: np.random.Generator, noise: float = PIXEL_NOISE
+) -> PixelCell:
     """The same cell at other joint values (m, n)."""
     world = cell.points @ cell.place[:3, :3].T + cell.place[:3, 3]
-    pixel = np.stack([
-        seen_by(view, cell.true, cell.law(q), world, cell.on_flange) for view in cell.views
-    ])  # fmt: skip
+    pixel = np.stack(
+        [
+            pixels_of_targets(view, cell.true, cell.law(q), world, cell.on_flange)
+            for view in cell.views
+        ]
+    )
     return replace(cell, q=q, pixel=pixel + noise * rng.normal(size=pixel.shape))
 
 
-def write_cell(cell: Cell, folder: Path, *, board: bool = True) -> list[str]:
+def write_cell_files(cell: PixelCell, folder: Path, *, with_board: bool = True) -> list[str]:
     """Write the files of a cell; the options of `calibrate` that read them."""
     folder.mkdir(parents=True, exist_ok=True)
     n = cell.q.shape[1]
@@ -223,9 +268,9 @@ def write_cell(cell: Cell, folder: Path, *, board: bool = True) -> list[str]:
     given = ["--pixels", str(folder / "detections.csv"), "--joints", str(folder / "joints.csv")]
     for c, view in enumerate(cell.views):
         path = folder / f"cam{c}.yaml"
-        path.write_text(camera_text(view))
+        path.write_text(format_camera_yaml(view))
         given += ["--camera", f"cam{c}={path}"]
-    if board:
+    if with_board:
         lines = ["target,x_mm,y_mm,z_mm"]
         places = zip(cell.names, 1e3 * cell.points, strict=True)
         lines += [f"{name},{x:.6f},{y:.6f},{z:.6f}" for name, (x, y, z) in places]
@@ -234,8 +279,8 @@ def write_cell(cell: Cell, folder: Path, *, board: bool = True) -> list[str]:
     return [*given, "--camera-on", "flange" if cell.on_flange else "ground"]
 
 
-def data_of(cell: Cell, *, board: bool = True) -> PixelData:
-    """What the files of `write_cell` are read as."""
+def build_pixel_data(cell: PixelCell, *, with_board: bool = True) -> PixelData:
+    """What the files of `write_cell_files` are read as."""
     camera, pose, target = np.nonzero(np.isfinite(cell.pixel[..., 0]))
     cameras = tuple(
         Camera(f"cam{c}", np.array([*v.lens, *v.distortion, *np.zeros(7)]), v.size, f"cam{c}.yaml")
@@ -248,7 +293,7 @@ def data_of(cell: Cell, *, board: bool = True) -> PixelData:
         labels=tuple(f"P{j}" for j in range(len(cell.q))),
         cameras=cameras,
         targets=cell.names,
-        board=cell.points if board else np.zeros((0, 3)),
+        board=cell.points if with_board else np.zeros((0, 3)),
         pose=pose,
         camera=camera,
         target=target,
@@ -257,33 +302,37 @@ def data_of(cell: Cell, *, board: bool = True) -> PixelData:
     )
 
 
-def camera_text(view: View) -> str:
+def format_camera_yaml(camera: SimulatedCamera) -> str:
     """A camera's file as OpenCV's FileStorage writes it."""
-    fx, fy, cx, cy = view.lens
+    fx, fy, cx, cy = camera.lens
     matrix = ", ".join(f"{x:.17g}" for x in (fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0))
-    distortion = ", ".join(f"{x:.17g}" for x in view.distortion)
+    distortion = ", ".join(f"{x:.17g}" for x in camera.distortion)
     return (
-        f"%YAML:1.0\n---\nimage_width: {view.size[0]}\nimage_height: {view.size[1]}\n"
+        f"%YAML:1.0\n---\nimage_width: {camera.size[0]}\nimage_height: {camera.size[1]}\n"
         "camera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n"
         f"   data: [ {matrix} ]\n"
         "distortion_coefficients: !!opencv-matrix\n"
-        f"   rows: {len(view.distortion)}\n   cols: 1\n   dt: d\n   data: [ {distortion} ]\n"
+        f"   rows: {len(camera.distortion)}\n   cols: 1\n   dt: d\n   data: [ {distortion} ]\n"
     )
 
 
-def arm_error(cell: Cell, arm: mc.Robot) -> float:
+def rms_arm_error_mm(cell: PixelCell, robot: mc.Robot) -> float:
     """RMS error of an arm over the joints' whole range, base and tool fitted [mm]."""
-    q = random_joints(cell.true, (POSES,), np.random.default_rng(0))
-    return 1e3 * missed(arm, q, tool_points(cell.true, cell.law(q)))
+    q = random_joint_values(cell.true, (ARM_ERROR_POSES,), np.random.default_rng(0))
+    return 1e3 * tool_position_rms_error(robot, q, tool_positions(cell.true, cell.law(q)))
 
 
-def least_variances(
-    cell: Cell, data: PixelData, active: Array, lens_sigma: Array, noise: float = NOISE
+def cramer_rao_variances(
+    cell: PixelCell,
+    data: PixelData,
+    is_fitted: Array,
+    lens_sigma: Array,
+    noise: float = PIXEL_NOISE,
 ) -> Array:
     """(f,) variances of independent parts of a squared arm error that no unbiased fit is below.
 
     Their sum is the Cramer-Rao bound of the mean square [mm^2]: at the true cell, with the true
-    noise.  active: (p,) what is fitted.  lens_sigma: (c, 9) of the lenses' files.
+    noise.  is_fitted: (p,) what is fitted.  lens_sigma: (c, 9) of the lenses' files.
     """
     cameras = [
         replace(camera, intrinsic=np.array([*view.lens, *view.distortion, *np.zeros(7)]))
@@ -291,11 +340,15 @@ def least_variances(
     ]
     poses = np.stack([view.pose for view in cell.views])
     data = replace(data, cameras=tuple(cameras))
-    images, own = Images.placed_at(data, poses, cell.place, cell.points, on_flange=cell.on_flange)
-    rows = PixelSquares.of(cell.true, images).rows(own_state(cell.true.mdh, own), active)[1]
-    known = np.pad(lens_sigma.reshape(-1) ** -2.0, (len(active) - lens_sigma.size, 0))[active]
-    cover = solve_normal(rows @ rows.T / noise**2 + np.diag(known), np.eye(len(rows)))
-    links = active[: 5 * cell.true.joints]
-    moved = free_motion(cell.true, everywhere(cell.true))[0][:, links]
+    images, own = CameraImages.build_with_start(
+        data, poses, cell.place, cell.points, on_flange=cell.on_flange
+    )
+    rows = PixelSquares.from_images(cell.true, images).rows(
+        build_own_state(cell.true.mdh, own), is_fitted
+    )[1]
+    known = np.pad(lens_sigma.reshape(-1) ** -2.0, (len(is_fitted) - lens_sigma.size, 0))[is_fitted]
+    cover = solve_normal_equations(rows @ rows.T / noise**2 + np.diag(known), np.eye(len(rows)))
+    links = is_fitted[: 5 * cell.true.joints]
+    moved = tool_motion_without_rigid(cell.true, sample_joint_range(cell.true))[0][:, links]
     root = np.linalg.cholesky(cover[: links.sum(), : links.sum()])
     return np.asarray(1e6 * np.linalg.svd(moved @ root, compute_uv=False) ** 2 / JUDGED)

@@ -8,11 +8,11 @@ import numpy as np
 from scipy import sparse
 from scipy.io import loadmat
 
-from experiments import real
+from experiments import real_arms
+from minimax_cal.core.arrays import Array
 from minimax_cal.fitting.calibrate import calibrate
-from minimax_cal.fitting.minimax_problem import measured_distances, minimax_problem
-from minimax_cal.fitting.solve import QP_TOLERANCE
-from minimax_cal.ground.arrays import Array
+from minimax_cal.fitting.cell_fit import FIT_QP_TOLERANCE
+from minimax_cal.fitting.minimax_problem import build_minimax_problem, measured_distances
 from minimax_cal.modelling.simulate import simulate
 from minimax_cal.robots.robot import load_robot
 from minimax_cal.solvers import minimax
@@ -20,12 +20,12 @@ from minimax_cal.solvers.epigraph_qp import ignore_warm_start
 from qp_backends import Problem, Solution
 from qp_backends import solve as solve_qp
 
-SHARED = real.SHARED / "maros_meszaros"
-MAROS = "Maros-Meszaros"
+MAROS_MESZAROS_FOLDER = real_arms.SHARED_DATA_FOLDER / "maros_meszaros"
+MAROS_MESZAROS_SET = "Maros-Meszaros"
 
 
 @dataclass(frozen=True, eq=False)
-class Case:
+class QpCase:
     """A problem and what is known of it: solvable, infeasible or unbounded."""
 
     name: str
@@ -33,14 +33,16 @@ class Case:
     kind: str = "solvable"
 
 
-def recorded(per: str, poses: int, seed: int) -> list[Case]:
+def record_sqp_qps(minimax_over: str, pose_count: int, seed: int) -> list[QpCase]:
     """The QPs that one minimax calibration really solves, in order."""
-    from experiments.speed import fitted
+    from experiments.speed import fit_least_squares
 
     robot = load_robot("irb2600")
-    data = simulate(robot, poses, 3, seed).data
-    model, state = fitted(robot, data)
-    problem = minimax_problem(model, state, measured_distances(data), "two-sided", per)
+    data = simulate(robot, pose_count, 3, seed).data
+    model, state = fit_least_squares(robot, data)
+    problem = build_minimax_problem(
+        model, state, measured_distances(data), "two-sided", minimax_over
+    )
     seen: list[Problem] = []
 
     def listen(qp: Problem) -> Solution:
@@ -49,34 +51,41 @@ def recorded(per: str, poses: int, seed: int) -> list[Case]:
 
     minimax.solve(problem, state, ignore_warm_start(listen))
     rows = len(seen[0].l)
-    return [Case(f"{per} {rows} rows, seed {seed}, QP {i + 1}", p) for i, p in enumerate(seen)]
+    return [
+        QpCase(f"{minimax_over} {rows} rows, seed {seed}, QP {i + 1}", p)
+        for i, p in enumerate(seen)
+    ]
 
 
-def calibration_qps(seed: int) -> list[Problem]:
+def record_calibration_qps(seed: int) -> list[Problem]:
     """Every QP that `mc.calibrate` puts to its backend: IRB 2600, 100 poses, three targets."""
     asked: list[Problem] = []
 
     def listen(problem: Problem) -> Solution:
         asked.append(problem)
-        return solve_qp(problem, "daqp", tolerance=QP_TOLERANCE)
+        return solve_qp(problem, "daqp", tolerance=FIT_QP_TOLERANCE)
 
     calibrate("irb2600", simulate(load_robot("irb2600"), 100, 3, seed).data, qp=listen)
     return asked
 
 
-def calibration_small(quick: bool) -> list[Case]:
+def list_small_calibration_qps(quick: bool) -> list[QpCase]:
     """Worst of three targets with three distance rows."""
-    return [case for seed in range(3 if quick else 20) for case in recorded("target", 100, seed)]
+    return [
+        case for seed in range(3 if quick else 20) for case in record_sqp_qps("target", 100, seed)
+    ]
 
 
-def calibration_large(quick: bool) -> list[Case]:
+def list_large_calibration_qps(quick: bool) -> list[QpCase]:
     """Worst of 300 points with three distance rows."""
-    return [case for seed in range(1 if quick else 4) for case in recorded("point", 100, seed)]
+    return [
+        case for seed in range(1 if quick else 4) for case in record_sqp_qps("point", 100, seed)
+    ]
 
 
-def maros_meszaros(quick: bool) -> list[Case]:
+def read_maros_meszaros_qps(quick: bool) -> list[QpCase]:
     """The problems in shared data, if there: Maros and Meszaros 1999, in the OSQP form."""
-    paths = sorted(SHARED.glob("*.mat"))
+    paths = sorted(MAROS_MESZAROS_FOLDER.glob("*.mat"))
     cases = []
     for path in paths:
         data = loadmat(path)
@@ -84,11 +93,11 @@ def maros_meszaros(quick: bool) -> list[Case]:
         low, high = data["l"].ravel(), data["u"].ravel()
         low = np.where(low <= -1e20, -np.inf, low)  # the set's way to write infinity
         high = np.where(high >= 1e20, np.inf, high)
-        cases.append(Case(path.stem, Problem(P, data["q"].ravel(), A, low, high)))
+        cases.append(QpCase(path.stem, Problem(P, data["q"].ravel(), A, low, high)))
     return [case for case in cases if len(case.problem.q) < 200] if quick else cases
 
 
-def hard(quick: bool) -> list[Case]:
+def build_hard_qps(quick: bool) -> list[QpCase]:
     """Degenerate, nearly singular, badly scaled, infeasible and unbounded problems."""
     rng = np.random.default_rng(0)
     cases = []
@@ -105,37 +114,39 @@ def hard(quick: bool) -> list[Case]:
         twice = [np.repeat(side, 2) for side in (open_below, above)]
         lowest, highest = np.append(open_below, at[0] + 2.0), np.append(above, np.inf)
         made = {
-            "degenerate": problem_of(full, rows, np.zeros(m), x),
+            "degenerate": build_degenerate_qp(full, rows, np.zeros(m), x),
             "repeated rows": Problem(full, q, np.repeat(rows, 2, axis=0), *twice),
-            "nearly singular": Problem(spectrum(rng, n, 1e-9), q, rows, below, above),
+            "nearly singular": Problem(
+                draw_matrix_of_spectrum(rng, n, 1e-9), q, rows, below, above
+            ),
             "singular": Problem(root[:, :4] @ root[:, :4].T, q, rows, below, above),
-            "badly scaled": scaled(rng, Problem(full, q, rows, below, above)),
+            "badly scaled": scale_qp_badly(rng, Problem(full, q, rows, below, above)),
             "infeasible": Problem(full, q, np.vstack([rows, rows[:1]]), lowest, highest),
-            "unbounded": unbounded(rng, n),
+            "unbounded": draw_unbounded_qp(rng, n),
         }
         kinds = {name: name for name in ("infeasible", "unbounded")}
-        cases += [Case(f"{name} {trial}", problem, kinds.get(name, "solvable"))
+        cases += [QpCase(f"{name} {trial}", problem, kinds.get(name, "solvable"))
                   for name, problem in made.items()]  # fmt: skip
     return cases
 
 
-def problem_of(P: Array, rows: Array, room: Array, x: Array) -> Problem:
+def build_degenerate_qp(P: Array, rows: Array, slacks: Array, solution: Array) -> Problem:
     """More active rows than unknowns meet in x, which is the solution."""
-    count = len(x) + 5
+    count = len(solution) + 5
     y = np.where(np.arange(len(rows)) < count, 1.0, 0.0)
-    pull = -P @ x - rows.T @ y  # stationarity at x
-    slack = np.where(y > 0, 0.0, 1.0) + room
-    return Problem(P, pull, rows, np.full(len(rows), -np.inf), rows @ x + slack)
+    pull = -P @ solution - rows.T @ y  # stationarity at x
+    slack = np.where(y > 0, 0.0, 1.0) + slacks
+    return Problem(P, pull, rows, np.full(len(rows), -np.inf), rows @ solution + slack)
 
 
-def spectrum(rng: np.random.Generator, n: int, least: float) -> Array:
+def draw_matrix_of_spectrum(rng: np.random.Generator, n: int, least_eigenvalue: float) -> Array:
     """A symmetric matrix with eigenvalues from 1 down to least."""
     basis, _ = np.linalg.qr(rng.normal(size=(n, n)))
-    matrix = (basis * np.geomspace(1.0, least, n)) @ basis.T
+    matrix = (basis * np.geomspace(1.0, least_eigenvalue, n)) @ basis.T
     return np.asarray(0.5 * (matrix + matrix.T))
 
 
-def scaled(rng: np.random.Generator, problem: Problem) -> Problem:
+def scale_qp_badly(rng: np.random.Generator, problem: Problem) -> Problem:
     """The same problem in units that differ by up to 1e8, rows by up to 1e6."""
     unit = 10.0 ** rng.uniform(-4, 4, len(problem.q))
     row = 10.0 ** rng.uniform(-3, 3, len(problem.l))
@@ -148,7 +159,7 @@ def scaled(rng: np.random.Generator, problem: Problem) -> Problem:
     )
 
 
-def unbounded(rng: np.random.Generator, n: int) -> Problem:
+def draw_unbounded_qp(rng: np.random.Generator, n: int) -> Problem:
     """No curvature and no bound along one direction, downhill."""
     away = rng.normal(size=n)
     away /= np.linalg.norm(away)
@@ -159,9 +170,9 @@ def unbounded(rng: np.random.Generator, n: int) -> Problem:
     return Problem(0.5 * (P + P.T), -away, rows, -np.ones(8), np.ones(8))
 
 
-SETS = {
-    "calibration, 6 rows": calibration_small,
-    "calibration, 303 rows": calibration_large,
-    MAROS: maros_meszaros,
-    "hard": hard,
+QP_CASE_SETS = {
+    "calibration, 6 rows": list_small_calibration_qps,
+    "calibration, 303 rows": list_large_calibration_qps,
+    MAROS_MESZAROS_SET: read_maros_meszaros_qps,
+    "hard": build_hard_qps,
 }

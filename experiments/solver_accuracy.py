@@ -28,14 +28,14 @@ import qpsolvers
 from rich.progress import track
 from scipy import sparse
 
-from experiments.qp_cases import MAROS, SETS, Case, calibration_qps
-from experiments.record import canvas
-from experiments.speed import fitted
+from experiments.qp_cases import MAROS_MESZAROS_SET, QP_CASE_SETS, QpCase, record_calibration_qps
+from experiments.speed import fit_least_squares
+from experiments.study_record import new_figure
 from experiments.sweep import Study, study_options
-from minimax_cal.fitting.minimax_problem import measured_distances, minimax_problem
-from minimax_cal.fitting.solve import QP_TOLERANCE
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.tables import Table
+from minimax_cal.core.arrays import Array
+from minimax_cal.core.tables import Table
+from minimax_cal.fitting.cell_fit import FIT_QP_TOLERANCE
+from minimax_cal.fitting.minimax_problem import build_minimax_problem, measured_distances
 from minimax_cal.modelling.simulate import simulate
 from minimax_cal.robots.robot import load_robot
 from minimax_cal.solvers import minimax
@@ -45,18 +45,18 @@ from qp_backends import solve as solve_qp
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-SOLVED = 1e-6  # relative residual at which an answer counts as right
-LOOSE, TIGHT = 1e-6, 1e-9
-TOLERANCES = {"ours 1e-6": LOOSE, "ours 1e-9": TIGHT}
-SETTINGS = (*TOLERANCES, "own defaults")
-SHIFT = 1e-3  # of the shifted geometric mean of times [s]
-LIMIT = 3.0  # time for one problem [s]
-DIRECT = ("daqp", "quadprog", "piqp", "clarabel", "proxqp", "highs", "osqp", "scs")
-ACROSS = "fallback order"
+MAX_SOLVED_RESIDUAL = 1e-6  # relative residual at which an answer counts as right
+LOOSE_TOLERANCE, TIGHT_TOLERANCE = 1e-6, 1e-9
+TOLERANCE_BY_SETTING = {"ours 1e-6": LOOSE_TOLERANCE, "ours 1e-9": TIGHT_TOLERANCE}
+SOLVER_SETTINGS = (*TOLERANCE_BY_SETTING, "own defaults")
+TIME_MEAN_SHIFT_SECONDS = 1e-3  # of the shifted geometric mean of times [s]
+MAX_SECONDS_PER_PROBLEM = 3.0  # time for one problem [s]
+DIRECT_BACKENDS = ("daqp", "quadprog", "piqp", "clarabel", "proxqp", "highs", "osqp", "scs")
+FALLBACK_ORDER_NAME = "fallback order"
 
 
 @dataclass(frozen=True)
-class Run:
+class SolverRun:
     """One backend on one problem: its claim, and what the judge finds."""
 
     case: str
@@ -68,20 +68,22 @@ class Run:
     seconds: float
 
     @property
-    def right(self) -> bool:
+    def is_right(self) -> bool:
         """Solved to the judge's satisfaction, or rightly called infeasible or unbounded."""
         if self.kind != "solvable":
             return self.status == self.kind
-        return self.judged.worst <= SOLVED
+        return self.judged.worst <= MAX_SOLVED_RESIDUAL
 
     @property
-    def lie(self) -> bool:
+    def is_wrong_claim(self) -> bool:
         """Claimed solved, or a certificate, wrongly."""
         claims = {"solved", "infeasible", "unbounded"}
-        return self.status in claims and not self.right
+        return self.status in claims and not self.is_right
 
 
-def direct(problem: Problem, name: str) -> tuple[Callable[[], Any], Callable[[Any], Solution]]:
+def build_direct_call(
+    problem: Problem, solver_name: str
+) -> tuple[Callable[[], Any], Callable[[Any], Solution]]:
     """A call of qpsolvers with the solver's defaults on ready data, and how to read its answer."""
     sparse_form = sparse.issparse(problem.P) or sparse.issparse(problem.A)
     low, high = problem.l, problem.u
@@ -96,14 +98,14 @@ def direct(problem: Problem, name: str) -> tuple[Callable[[], Any], Callable[[An
         h = np.concatenate([high[above], -low[below]])
     E, b = (A[np.flatnonzero(same)], high[same]) if same.any() else (None, None)
     P = problem.P
-    if name in ("daqp", "quadprog") and sparse_form:
-        P, G, E = (None if m is None else dense(m) for m in (P, G, E))
-    elif name not in ("daqp", "quadprog"):
+    if solver_name in ("daqp", "quadprog") and sparse_form:
+        P, G, E = (None if m is None else to_dense(m) for m in (P, G, E))
+    elif solver_name not in ("daqp", "quadprog"):
         P, G, E = (None if m is None else sparse.csc_matrix(m) for m in (P, G, E))
     data = qpsolvers.Problem(P, problem.q, G, h, E, b)
 
     def call() -> Any:
-        return qpsolvers.solve_problem(data, solver=name)
+        return qpsolvers.solve_problem(data, solver=solver_name)
 
     def answer(found: Any) -> Solution:
         x, y = np.full(len(problem.q), np.nan), np.full(len(low), np.nan)
@@ -117,17 +119,17 @@ def direct(problem: Problem, name: str) -> tuple[Callable[[], Any], Callable[[An
             if found.y is not None and same.any():
                 y[same] = np.asarray(found.y, dtype=float)[: same.sum()]
         claim = found is not None and bool(found.found)
-        return Solution(x, y, Status.SOLVED if claim else Status.FAILED, 0.0, name)
+        return Solution(x, y, Status.SOLVED if claim else Status.FAILED, 0.0, solver_name)
 
     return call, answer
 
 
-def dense(matrix: Any) -> Array:
+def to_dense(matrix: Any) -> Array:
     """A matrix as an array."""
     return np.asarray(matrix.toarray() if hasattr(matrix, "toarray") else matrix)
 
 
-def quietly(call: Callable[[], Any]) -> tuple[Any, float]:
+def run_and_time_without_warnings(call: Callable[[], Any]) -> tuple[Any, float]:
     """What a call returns, and its seconds; solvers warn about what the judge measures."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -136,53 +138,65 @@ def quietly(call: Callable[[], Any]) -> tuple[Any, float]:
         return found, time.perf_counter() - began
 
 
-def own_defaults(problem: Problem, name: str) -> tuple[Solution, float]:
+def solve_with_own_defaults(problem: Problem, solver_name: str) -> tuple[Solution, float]:
     """The answer of a solver with its own defaults, and its seconds."""
-    call, answer = direct(problem, name)
-    found, seconds = quietly(call)
+    call, answer = build_direct_call(problem, solver_name)
+    found, seconds = run_and_time_without_warnings(call)
     return answer(found), seconds
 
 
-def in_time(pools: list[Pool], problem: Problem, name: str) -> tuple[Solution, float]:
-    """`own_defaults` in the process of the one pool, ended when it takes too long.
+def solve_within_time_limit(
+    pools: list[Pool], problem: Problem, solver_name: str
+) -> tuple[Solution, float]:
+    """`solve_with_own_defaults` in the process of the one pool, ended when it takes too long.
 
     Raises TimeoutError.
     """
     if not pools:  # a fork may hang in a solver's threads
         pools.append(multiprocessing.get_context("spawn").Pool(1))
-        pools[0].apply(shifted_mean, ([0.0],))  # starting does not count
+        pools[0].apply(shifted_geometric_mean, ([0.0],))  # starting does not count
     try:
-        return pools[0].apply_async(own_defaults, (problem, name)).get(LIMIT)
+        return (
+            pools[0]
+            .apply_async(solve_with_own_defaults, (problem, solver_name))
+            .get(MAX_SECONDS_PER_PROBLEM)
+        )
     except multiprocessing.TimeoutError:
         pools.pop().terminate()
         raise TimeoutError from None
 
 
-def ours(problem: Problem, name: str, tolerance: float) -> tuple[Solution, float]:
+def solve_with_our_backend(
+    problem: Problem, backend_name: str, tolerance: float
+) -> tuple[Solution, float]:
     """The answer of our `solve`, or of its fallback order, and its seconds."""
-    across = name == ACROSS
-    solve = partial(solve_qp, problem, "daqp" if across else name, tolerance=tolerance)
-    return quietly(partial(solve, time_limit=LIMIT, fallback=across))
+    across = backend_name == FALLBACK_ORDER_NAME
+    solve = partial(solve_qp, problem, "daqp" if across else backend_name, tolerance=tolerance)
+    return run_and_time_without_warnings(
+        partial(solve, time_limit=MAX_SECONDS_PER_PROBLEM, fallback=across)
+    )
 
 
-def attempt(case: Case, backend: str, setting: str, pools: list[Pool]) -> Run:
+def run_and_judge_backend(case: QpCase, backend: str, setting: str, pools: list[Pool]) -> SolverRun:
     """Run one backend in one setting on one problem, and judge it."""
-    problem, seconds = case.problem, LIMIT
+    problem, seconds = case.problem, MAX_SECONDS_PER_PROBLEM
     solution = Solution(np.zeros(0), np.zeros(0), Status.FAILED, 0.0, backend)
     try:
         if setting == "own defaults":
-            solution, seconds = in_time(pools, problem, backend)
+            solution, seconds = solve_within_time_limit(pools, problem, backend)
         else:
-            solution, seconds = ours(problem, backend, TOLERANCES[setting])
+            solution, seconds = solve_with_our_backend(
+                problem, backend, TOLERANCE_BY_SETTING[setting]
+            )
     except TimeoutError:
         solution = replace(solution, status=Status.TIME_LIMIT)
     except Exception as error:  # a third-party solver may raise anything; the row then says failed
         solution = replace(solution, notes=(str(error),))
     status, judged = solution.status.name.lower(), accuracy(problem, solution)
-    return Run(case.name, case.kind, backend, setting, status, judged, seconds)
+    return SolverRun(case.name, case.kind, backend, setting, status, judged, seconds)
 
 
-def references(cases: Sequence[Case]) -> dict[str, float]:
+def reference_objectives(cases: Sequence[QpCase]) -> dict[str, float]:
     """Objectives by problem from the most accurate answer of several solvers; NaN without one."""
     values = {}
     for case in cases:
@@ -190,7 +204,11 @@ def references(cases: Sequence[Case]) -> dict[str, float]:
         for name in ("daqp", "quadprog", "piqp", "clarabel", "highs"):
             if case.kind == "solvable" and name in available() and best[0] > 1e-13:
                 solution = solve_qp(
-                    case.problem, name, tolerance=1e-11, time_limit=LIMIT, fallback=False
+                    case.problem,
+                    name,
+                    tolerance=1e-11,
+                    time_limit=MAX_SECONDS_PER_PROBLEM,
+                    fallback=False,
                 )
                 judged = accuracy(case.problem, solution)
                 best = min(best, (judged.worst, judged.objective))
@@ -198,29 +216,42 @@ def references(cases: Sequence[Case]) -> dict[str, float]:
     return values
 
 
-def shifted_mean(times: Sequence[float]) -> float:
+def shifted_geometric_mean(times: Sequence[float]) -> float:
     """Shifted geometric mean [s], robust against both very fast and very slow problems."""
-    return float(np.exp(np.mean(np.log(np.array(times) + SHIFT))) - SHIFT)
+    return float(
+        np.exp(np.mean(np.log(np.array(times) + TIME_MEAN_SHIFT_SECONDS))) - TIME_MEAN_SHIFT_SECONDS
+    )
 
 
-def table_of(group: str, runs: Sequence[Run], reference: dict[str, float]) -> Table:
+def build_accuracy_table(
+    set_name: str, runs: Sequence[SolverRun], reference_objectives: dict[str, float]
+) -> Table:
     """One set of problems: a row a backend and setting."""
     rows = []
     keys = dict.fromkeys((run.backend, run.setting) for run in runs)
     for backend, setting in keys:
         mine = [run for run in runs if (run.backend, run.setting) == (backend, setting)]
-        solved = [run for run in mine if run.right and run.kind == "solvable"]
-        known = [(r.judged.objective, reference[r.case]) for r in solved]
+        solved = [run for run in mine if run.is_right and run.kind == "solvable"]
+        known = [(r.judged.objective, reference_objectives[r.case]) for r in solved]
         off = [
             abs(value - best) / max(1.0, abs(best)) for value, best in known if np.isfinite(best)
         ]
         worst = [max((getattr(run.judged, name) for run in solved), default=np.nan)
                  for name in ("worst", "primal", "dual", "gap")]  # fmt: skip
-        rows.append((backend, setting, len(mine), float(100.0 * np.mean([r.right for r in mine])),
-                     sum(run.lie for run in mine), *worst, max(off, default=np.nan),
-                     1e3 * shifted_mean([run.seconds for run in mine])))  # fmt: skip
-    return Table.made(
-        f"{group}: residuals are the largest over the problems solved",
+        rows.append(
+            (
+                backend,
+                setting,
+                len(mine),
+                float(100.0 * np.mean([r.is_right for r in mine])),
+                sum(run.is_wrong_claim for run in mine),
+                *worst,
+                max(off, default=np.nan),
+                1e3 * shifted_geometric_mean([run.seconds for run in mine]),
+            )
+        )
+    return Table.from_rows(
+        f"{set_name}: residuals are the largest over the problems solved",
         rows,
         "backend | setting | problems d | right % .1f | wrongly claimed d | "
         "worst relative .1e | primal abs .1e | dual abs .1e | gap abs .1e | "
@@ -228,7 +259,9 @@ def table_of(group: str, runs: Sequence[Run], reference: dict[str, float]) -> Ta
     )
 
 
-def cost_of_solve(problems: Sequence[Problem], backends: Sequence[str], repeats: int) -> Table:
+def build_solve_cost_table(
+    problems: Sequence[Problem], backends: Sequence[str], repeats: int
+) -> Table:
     """Processor time of our `solve` beside others on the QPs of one calibration, as it asks them.
 
     Ours checks each answer and asks for the calibration's tolerance; qpsolvers.solve_problem gets
@@ -240,35 +273,36 @@ def cost_of_solve(problems: Sequence[Problem], backends: Sequence[str], repeats:
         spent = np.zeros((len(problems), 3))
         for number, problem in enumerate(problems):
             calls: list[Callable[[], Any]] = [
-                partial(solve_qp, problem, backend, tolerance=QP_TOLERANCE),
-                direct(problem, backend)[0],
-                *([raw_daqp(problem)] if backend == "daqp" else []),
+                partial(solve_qp, problem, backend, tolerance=FIT_QP_TOLERANCE),
+                build_direct_call(problem, backend)[0],
+                *([build_raw_daqp_call(problem)] if backend == "daqp" else []),
             ]
-            times = [[processor_time(call) for call in calls] for _ in range(repeats + 1)]
+            times = [[mean_processor_seconds(call) for call in calls] for _ in range(repeats + 1)]
             spent[number, : len(calls)] = np.median(times[1:], axis=0)
         ours, theirs, raw = 1e6 * spent.mean(axis=0)
         raw = raw or np.nan
         rows.append((backend, len(problems), ours, theirs, ours / theirs, raw, ours / raw))
-    return Table.made(
+    return Table.from_rows(
         "what solve costs beside qpsolvers and beside daqp itself, on the QPs of mc.calibrate of "
-        f"an IRB 2600 (100 poses, three targets, objective minimax), tolerance {QP_TOLERANCE:g}",
+        f"an IRB 2600 (100 poses, three targets, objective "
+        f"minimax), tolerance {FIT_QP_TOLERANCE:g}",
         rows,
         "backend | QPs d | qp_backends.solve us .0f | qpsolvers.solve_problem us .0f | "
         "ours over it .2f | daqp.solve us .0f | ours over that .2f",
     )
 
 
-def raw_daqp(problem: Problem) -> Callable[[], Any]:
+def build_raw_daqp_call(problem: Problem) -> Callable[[], Any]:
     """A call of daqp itself on ready arrays: simple bounds are rows, and equalities are marked."""
     daqp = import_module("daqp")
-    rows = np.ascontiguousarray(dense(problem.A))
+    rows = np.ascontiguousarray(to_dense(problem.A))
     low, high = np.maximum(problem.l, -1e30), np.minimum(problem.u, 1e30)
     sense = np.where(low == high, 5, 0).astype(np.int32)
-    P = np.ascontiguousarray(dense(problem.P))
+    P = np.ascontiguousarray(to_dense(problem.P))
     return lambda: daqp.solve(P, problem.q, rows, high, low, sense)
 
 
-def processor_time(call: Callable[[], Any]) -> float:
+def mean_processor_seconds(call: Callable[[], Any]) -> float:
     """Seconds of the processor that a call takes, the mean over at least 2 ms of calls [s]."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # solvers warn about what the judge measures
@@ -279,16 +313,18 @@ def processor_time(call: Callable[[], Any]) -> float:
         return (time.process_time() - began) / count
 
 
-def subgradient(cases: Sequence[Case], most: int) -> tuple[Table, dict[str, Array]]:
+def build_subgradient_table(
+    cases: Sequence[QpCase], max_iterations: int
+) -> tuple[Table, dict[str, Array]]:
     """Relative objective error of the subgradient methods against iterations."""
     from qp_backends.subgradient import METHODS, iterate
 
-    marks = [10**k for k in range(1, 7) if 10**k <= most]
-    reference = references(cases)
+    marks = [10**k for k in range(1, 7) if 10**k <= max_iterations]
+    reference = reference_objectives(cases)
     curves: dict[str, Array] = {}
     rows = []
     for method in METHODS:
-        reach = [mark for mark in marks if method == "restarted" or mark <= most // 10]
+        reach = [mark for mark in marks if method == "restarted" or mark <= max_iterations // 10]
         errors = np.full((len(cases), len(marks)), np.nan)
         judged_well = np.zeros(len(cases), dtype=bool)
         for i, case in enumerate(cases):
@@ -298,17 +334,17 @@ def subgradient(cases: Sequence[Case], most: int) -> tuple[Table, dict[str, Arra
                 while pending and answer.iterations > pending[0][1]:
                     errors[i, pending.pop(0)[0]] = error
                 judged = accuracy(case.problem, answer)
-                error = shortfall(judged, reference[case.name])
-                judged_well[i] |= judged.worst <= SOLVED
+                error = objective_or_row_error(judged, reference[case.name])
+                judged_well[i] |= judged.worst <= MAX_SOLVED_RESIDUAL
                 if not pending or error < 1e-13:
                     break
             for j, _ in pending:
                 errors[i, j] = error
         curves[method] = errors
-        hit = 100.0 * np.mean(np.nanmin(errors, axis=1) <= SOLVED)
+        hit = 100.0 * np.mean(np.nanmin(errors, axis=1) <= MAX_SOLVED_RESIDUAL)
         middle = [float(np.median(column)) for column in errors.T]
         rows.append((method, float(hit), float(100.0 * judged_well.mean()), *middle))
-    table = Table.made(
+    table = Table.from_rows(
         f"restarted averaged PDHG and paper M's subgradient on {len(cases)} calibration QPs: "
         "median error (of the objective, relative to max f, or of the rows) against iterations; "
         "share within 1e-6, and share that the judge finds solved",
@@ -319,22 +355,25 @@ def subgradient(cases: Sequence[Case], most: int) -> tuple[Table, dict[str, Arra
     return table, {"iterations": np.array(marks, dtype=float), **curves}
 
 
-def shortfall(judged: Accuracy, target: float) -> float:
+def objective_or_row_error(judged: Accuracy, reference_objective: float) -> float:
     """Error of an iterate: of its objective, or of its constraints where that is larger.
 
     The QP's values are relative to max f = 1, so 1 is the scale of the objective.
     """
     if not np.isfinite(judged.worst):
         return float("inf")
-    return max(abs(judged.objective - target) / max(1.0, abs(target)), judged.primal_relative)
+    return max(
+        abs(judged.objective - reference_objective) / max(1.0, abs(reference_objective)),
+        judged.primal_relative,
+    )
 
 
-def sqp_values(backends: Sequence[str], seed: int) -> Table:
+def build_sqp_value_table(backends: Sequence[str], seed: int) -> Table:
     """The max F_i / m_i that the calibration's SQP reaches with each backend."""
     robot = load_robot("irb2600")
     data = simulate(robot, 100, 3, seed).data
-    model, state = fitted(robot, data)
-    problem = minimax_problem(model, state, measured_distances(data), "two-sided", "target")
+    model, state = fit_least_squares(robot, data)
+    problem = build_minimax_problem(model, state, measured_distances(data), "two-sided", "target")
     rows = []
     best = np.nan
     for backend in backends:
@@ -354,7 +393,7 @@ def sqp_values(backends: Sequence[str], seed: int) -> Table:
         best = value if np.isnan(best) else min(best, value)
         rows.append((backend, str(found.status), found.iterations, value, value / best - 1.0,
                      found.kkt.residual, 1e3 * seconds))  # fmt: skip
-    return Table.made(
+    return Table.from_rows(
         "minimax calibration (IRB 2600, 100 poses, three targets) with each backend",
         rows,
         "backend | status | QPs d | max F_i/m mm^2 .9f | above the first .1e | "
@@ -362,33 +401,35 @@ def sqp_values(backends: Sequence[str], seed: int) -> Table:
     )
 
 
-def profile(group: str, runs: Sequence[Run]) -> Figure:
+def draw_performance_profile(set_name: str, runs: Sequence[SolverRun]) -> Figure:
     """Performance profile: share of problems solved within a factor of the fastest time."""
-    figure = canvas(7, 4.5)
+    figure = new_figure(7, 4.5)
     axes = figure.subplots()
     ours = [run for run in runs if run.setting == "ours 1e-6"]
     names = dict.fromkeys(run.case for run in ours)
     fastest = {
-        name: min((run.seconds for run in ours if run.case == name and run.right), default=np.nan)
+        name: min(
+            (run.seconds for run in ours if run.case == name and run.is_right), default=np.nan
+        )
         for name in names
     }
     for number, backend in enumerate(dict.fromkeys(run.backend for run in ours)):
         mine = [run for run in ours if run.backend == backend]
-        ratio = np.sort([r.seconds / fastest[r.case] if r.right else np.inf for r in mine])
+        ratio = np.sort([r.seconds / fastest[r.case] if r.is_right else np.inf for r in mine])
         share = 100.0 * (np.arange(len(ratio)) + 1) / len(ratio)
         shown = np.isfinite(ratio)
         style = ("-", "--", ":")[number // 10 % 3]
         axes.step(ratio[shown], share[shown], where="post", label=backend, linestyle=style)
     axes.set(xscale="log", xlabel="time / fastest time", ylabel="problems solved to 1e-6 (%)",
-             ylim=(0, 102), title=group)  # fmt: skip
+             ylim=(0, 102), title=set_name)  # fmt: skip
     axes.grid(visible=True, alpha=0.3)
     axes.legend(fontsize="small", loc="lower right")
     return figure
 
 
-def convergence_figure(curves: dict[str, Array]) -> Figure:
+def draw_convergence_figure(curves: dict[str, Array]) -> Figure:
     """Error of the subgradient methods against iterations: median and quartiles."""
-    figure = canvas(7, 4.5)
+    figure = new_figure(7, 4.5)
     axes = figure.subplots()
     marks = curves["iterations"]
     for method, errors in curves.items():
@@ -406,30 +447,32 @@ def convergence_figure(curves: dict[str, Array]) -> Figure:
     return figure
 
 
-def backends_here(quick: bool) -> list[str]:
+def list_available_backends(quick: bool) -> list[str]:
     """Installed backends worth a row, the fallback order last."""
-    found = [name for name in (*DIRECT, "ecos", "qpalm", "cvxpy") if name in available()]
-    return [*found, "subgradient", ACROSS] if not quick else [*found, ACROSS]
+    found = [name for name in (*DIRECT_BACKENDS, "ecos", "qpalm", "cvxpy") if name in available()]
+    return (
+        [*found, "subgradient", FALLBACK_ORDER_NAME] if not quick else [*found, FALLBACK_ORDER_NAME]
+    )
 
 
-def runs_of(quick: bool) -> tuple[dict[str, list[Run]], dict[str, list[Case]]]:
+def run_all_backends(quick: bool) -> tuple[dict[str, list[SolverRun]], dict[str, list[QpCase]]]:
     """All runs by set, and the problems."""
-    runs: dict[str, list[Run]] = {}
-    problems: dict[str, list[Case]] = {}
+    runs: dict[str, list[SolverRun]] = {}
+    problems: dict[str, list[QpCase]] = {}
     pools: list[Pool] = []
-    for group, make in SETS.items():
+    for group, make in QP_CASE_SETS.items():
         cases = make(quick)
         problems[group] = cases
         jobs = [
             (case, backend, setting)
-            for backend in backends_here(quick)
-            for setting in SETTINGS
-            if not (setting == "own defaults" and backend not in DIRECT)
+            for backend in list_available_backends(quick)
+            for setting in SOLVER_SETTINGS
+            if not (setting == "own defaults" and backend not in DIRECT_BACKENDS)
             and not (backend == "subgradient" and (setting == "ours 1e-9" or "calib" not in group))
             for case in cases
         ]
         runs[group] = [
-            attempt(case, backend, setting, pools)
+            run_and_judge_backend(case, backend, setting, pools)
             for case, backend, setting in track(jobs, description=group, transient=True)
         ]
     for pool in pools:
@@ -444,7 +487,7 @@ def main(study: Study) -> None:
     Times are compared, so the runs go one after the other: --jobs and --cluster do not apply.
     """
     quick = study.quick
-    runs, problems = runs_of(quick)
+    runs, problems = run_all_backends(quick)
     tables: list[Table] = []
     figures: dict[str, Figure] = {}
     summary: dict[str, object] = {}
@@ -452,24 +495,33 @@ def main(study: Study) -> None:
         if not found:
             click.echo(f"{group}: no problems here (shared data absent)")
             continue
-        tables.append(table_of(group, found, references(problems[group])))
+        tables.append(build_accuracy_table(group, found, reference_objectives(problems[group])))
         summary[group] = [
             {"backend": row[0], "setting": row[1], "right_percent": row[3], "lies": row[4]}
             for row in tables[-1].rows
         ]
-        if group == MAROS:
-            figures[f"profile_{group}"] = profile(group, found)
+        if group == MAROS_MESZAROS_SET:
+            figures[f"profile_{group}"] = draw_performance_profile(group, found)
     small = problems["calibration, 6 rows"]
-    direct_ones = [name for name in DIRECT if name in available()]
-    timing = cost_of_solve(calibration_qps(study.seed), direct_ones, 3 if quick else 9)
-    sub, curves = subgradient(small[:4] if quick else small, 10_000 if quick else 100_000)
-    values = sqp_values([*direct_ones, "cvxpy", "subgradient"], study.seed)
-    figures["subgradient"] = convergence_figure(curves)
+    direct_ones = [name for name in DIRECT_BACKENDS if name in available()]
+    timing = build_solve_cost_table(
+        record_calibration_qps(study.seed), direct_ones, 3 if quick else 9
+    )
+    sub, curves = build_subgradient_table(
+        small[:4] if quick else small, 10_000 if quick else 100_000
+    )
+    values = build_sqp_value_table([*direct_ones, "cvxpy", "subgradient"], study.seed)
+    figures["subgradient"] = draw_convergence_figure(curves)
     summary["overhead_ratio"] = {str(row[0]): row[4] for row in timing.rows}
     summary["subgradient_reach_percent"] = {str(row[0]): row[1] for row in sub.rows}
     summary["sqp_above_best"] = {str(row[0]): row[4] for row in values.rows}
     packages = available().keys() - {"proxqp", "highs", "subgradient"}
     study.save([*tables, timing, sub, values], summary, figures, packages)
-    lies = [run for found in runs.values() for run in found if run.lie and "ours" in run.setting]
+    lies = [
+        run
+        for found in runs.values()
+        for run in found
+        if run.is_wrong_claim and "ours" in run.setting
+    ]
     if lies:
         raise click.ClickException(f"{len(lies)} wrong answers were passed on as right")

@@ -33,36 +33,37 @@ from threadpoolctl import threadpool_limits
 
 import minimax_cal as mc
 from experiments import speed_peers
-from experiments.record import processor
-from experiments.speed_peers import Raw
+from experiments.speed_peers import RawCalibration
+from experiments.study_record import processor_name
 from experiments.sweep import Study, study_options
-from minimax_cal.fitting import identify
+from minimax_cal.core.tables import Table
+from minimax_cal.fitting import identification
+from minimax_cal.fitting.cell_fit import FIT_QP_TOLERANCE
 from minimax_cal.fitting.minimax_problem import (
-    Distances,
     MinimaxProblem,
+    TargetDistanceLimits,
+    build_minimax_problem,
     measured_distances,
-    minimax_problem,
 )
-from minimax_cal.fitting.options import solver_of
-from minimax_cal.fitting.solve import QP_TOLERANCE
-from minimax_cal.ground.tables import Table
-from minimax_cal.measuring.history import with_history
+from minimax_cal.fitting.options import build_qp_solver
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.modelling import start
+from minimax_cal.measuring.visit_history import add_history_columns
+from minimax_cal.modelling import global_start
 from minimax_cal.modelling.effects.table import Fitted, Term
-from minimax_cal.modelling.model import Model, SumOfSquares, model_of
-from minimax_cal.modelling.near import nearby
-from minimax_cal.modelling.parameters import State
+from minimax_cal.modelling.nearby_fit import fit_nearby
+from minimax_cal.modelling.parameters import ParameterValues
+from minimax_cal.modelling.point_model import PointLeastSquares, PointModel, build_point_model
 from minimax_cal.modelling.simulate import simulate
-from minimax_cal.robots.kernels import choice, plain
+from minimax_cal.robots.joint_sampling import random_joint_values
+from minimax_cal.robots.kernels import kernel_choice, plain
 from minimax_cal.robots.robot import Robot, load_robot
-from minimax_cal.robots.sampling import random_joints
 from minimax_cal.solvers import least_squares, minimax
 
-PARTS = ("races", "points", "bootstrap", "command", "growth", "diagnosis")
-SAME = 1e-6  # relative difference of two optima that are called the same
-NOISE = 2e-5  # of a coordinate, where very many poses are made [m]
-LAWS = (  # of an arm like a real one, beside the compliance that each has, with values in SI
+SPEED_PARTS = ("races", "points", "bootstrap", "command", "growth", "diagnosis")
+MAX_SAME_OPTIMUM_DIFFERENCE = 1e-6  # relative difference of two optima that are called the same
+SPEED_COORDINATE_NOISE = 2e-5  # of a coordinate, where very many poses are made [m]
+# of an arm like a real one, beside the compliance that each has, with values in SI
+REAL_LIKE_EFFECT_TERMS = (
     (Term("gear_error", "J1", {"turns": 1.0}), (1e-4, 5e-5)),
     (Term("gear_ripple", "J2", {"turns": 120.0}), (3e-5, 2e-5)),
     (Term("gear_ripple", "J3", {"turns": 100.0}), (4e-5, 1e-5)),
@@ -70,80 +71,100 @@ LAWS = (  # of an arm like a real one, beside the compliance that each has, with
     (Term("axis_wobble", "J5", {"turns": 1.0}), (5e-5, 5e-5)),
     (Term("target_offset", "smr1"), (5e-5,)),
 )
-Run = Callable[[], object]
+TimedRun = Callable[[], object]
 
 
 @dataclass(frozen=True, eq=False)
-class Case:
+class SpeedCase:
     """A simulated calibration, ready to be fitted: model with its identified parameters, start."""
 
     robot: Robot
-    model: Model
-    begin: State
-    worst: Callable[[State], MinimaxProblem]
+    model: PointModel
+    begin: ParameterValues
+    worst: Callable[[ParameterValues], MinimaxProblem]
 
 
-def case_of(poses: int, seed: int) -> Case:
+def simulate_speed_case(pose_count: int, seed: int) -> SpeedCase:
     """IRB 2600, three targets, geometric errors, some compliance, tracker noise."""
     robot = load_robot("irb2600")
-    data = simulate(robot, poses, 3, seed).data
-    model, begin = identified(robot, data)
+    data = simulate(robot, pose_count, 3, seed).data
+    model, begin = identify_parameters(robot, data)
     distances = measured_distances(data)
-    return Case(
-        robot, model, begin, lambda x: minimax_problem(model, x, distances, "two-sided", "target")
-    )
-
-
-def identified(robot: Robot, data: Measurements) -> tuple[Model, State]:
-    """The model with its identified parameters free, and the nominal start."""
-    model = model_of(robot, data)
-    begin = start.fit_base(model, robot.mdh).state
-    found = identify.identify(
+    return SpeedCase(
+        robot,
         model,
         begin,
-        identify.drop_order(robot, model.names),
-        allowed=model.active,
-        reference=identify.plenty_of_poses(robot, model),
-        known=np.zeros(model.names.count, dtype=bool),
+        lambda x: build_minimax_problem(model, x, distances, "two-sided", "target"),
     )
-    return model.only(found.active), begin
 
 
-def fitted(robot: Robot, data: Measurements) -> tuple[Model, State]:
+def identify_parameters(robot: Robot, data: Measurements) -> tuple[PointModel, ParameterValues]:
+    """The model with its identified parameters free, and the nominal start."""
+    model = build_point_model(robot, data)
+    begin = global_start.fit_base_and_targets(model, robot.mdh).state
+    found = identification.identify_point_parameters(
+        model,
+        begin,
+        identification.redundancy_drop_order(robot, model.names),
+        is_allowed=model.active,
+        reference_model=identification.build_reference_model(robot, model),
+        has_prior=np.zeros(model.names.parameter_count, dtype=bool),
+    )
+    return model.with_active(found.active), begin
+
+
+def fit_least_squares(robot: Robot, data: Measurements) -> tuple[PointModel, ParameterValues]:
     """The same with its least-squares fit."""
-    model, begin = identified(robot, data)
-    found = least_squares.solve(SumOfSquares(model), begin.batch(), 1, float(model.counts.sum()))
+    model, begin = identify_parameters(robot, data)
+    found = least_squares.solve(
+        PointLeastSquares(model), begin.batch(), 1, float(model.pose_counts_by_target.sum())
+    )
     return model, found.x.take(np.array(0))
 
 
-def raw_of(case: Case, data: Measurements) -> Raw:
+def to_raw_arrays(case: SpeedCase, data: Measurements) -> RawCalibration:
     """The same for the peers, as plain arrays."""
     kept, x = measured_distances(data), case.begin
     free = np.flatnonzero(case.model.active)
-    return Raw(case.model.q, data.y, x.mdh, x.rotation, x.origin, x.target_positions, free,
-               kept.pairs, kept.mean, kept.tolerance)  # fmt: skip
+    return RawCalibration(
+        case.model.q,
+        data.y,
+        x.mdh,
+        x.rotation,
+        x.origin,
+        x.target_positions,
+        free,
+        kept.pairs,
+        kept.mean,
+        kept.tolerance,
+    )
 
 
-def squares(case: Case) -> State:
+def solve_least_squares(case: SpeedCase) -> ParameterValues:
     """Our least squares from the nominal start."""
-    return nearby(case.model, case.begin).x.take(np.array(0))
+    return fit_nearby(case.model, case.begin).x.take(np.array(0))
 
 
-def worst_target(case: Case) -> float:
+def solve_minimax_over_targets(case: SpeedCase) -> float:
     """Our minimax from the nominal start, least squares included: max F_i / m_i [m^2]."""
-    begin = squares(case)
+    begin = solve_least_squares(case)
     problem = case.worst(begin)
-    return minimax.solve(problem, begin, solver_of("daqp", QP_TOLERANCE)[0]).value * problem.size
+    return (
+        minimax.solve(problem, begin, build_qp_solver("daqp", FIT_QP_TOLERANCE)[0]).value
+        * problem.size
+    )
 
 
-def worst_point(case: Case, begin: State, kept: Distances) -> float:
+def solve_minimax_over_points(
+    case: SpeedCase, start: ParameterValues, distances: TargetDistanceLimits
+) -> float:
     """Our least worst point from a least-squares fit, distances left free [m]."""
-    problem = minimax_problem(case.model, begin, kept, "off", "point")
-    found = minimax.solve(problem, begin, solver_of("daqp", QP_TOLERANCE)[0])
+    problem = build_minimax_problem(case.model, start, distances, "off", "point")
+    found = minimax.solve(problem, start, build_qp_solver("daqp", FIT_QP_TOLERANCE)[0])
     return float(np.sqrt(found.value * problem.size))
 
 
-def race(runs: Mapping[str, Run], repeats: int) -> dict[str, float]:
+def time_runs_in_turn(runs: Mapping[str, TimedRun], repeats: int) -> dict[str, float]:
     """Median processor time of each, the runs taken in turn after one that does not count [s]."""
     times: dict[str, list[float]] = {name: [] for name in runs}
     for run in runs.values():
@@ -158,57 +179,64 @@ def race(runs: Mapping[str, Run], repeats: int) -> dict[str, float]:
     return {name: statistics.median(values) for name, values in times.items()}
 
 
-def alike(name: str, values: Mapping[str, float]) -> None:
+def check_same_optimum(name: str, values: Mapping[str, float]) -> None:
     """ClickException where optima differ."""
-    if max(values.values()) > min(values.values()) * (1.0 + SAME):
+    if max(values.values()) > min(values.values()) * (1.0 + MAX_SAME_OPTIMUM_DIFFERENCE):
         raise click.ClickException(f"{name}: the optima differ: {values}")
 
 
-def races(seed: int, repeats: int, *, quick: bool) -> dict[str, float]:
+def time_100_pose_fits(seed: int, repeats: int, *, quick: bool) -> dict[str, float]:
     """Seconds of everything at 100 poses by name; all must reach the same optimum."""
-    case, data = case_of(100, seed), simulated(100, seed)
-    raw = raw_of(case, data)
-    scale, size = speed_peers.scaled(raw)
-    fits: dict[str, Run] = {
-        "squares": lambda: squares(case),
-        "squares_without_numba": lambda: briefly(partial(squares, case)),
-        "squares_numpy_gn": lambda: speed_peers.gauss_newton(raw),
-        "squares_scipy": lambda: speed_peers.scipy_squares(raw),
+    case, data = simulate_speed_case(100, seed), simulate_measurements(100, seed)
+    raw = to_raw_arrays(case, data)
+    scale, size = speed_peers.parameter_and_value_scales(raw)
+    fits: dict[str, TimedRun] = {
+        "squares": lambda: solve_least_squares(case),
+        "squares_without_numba": lambda: run_with_numpy_kernels(partial(solve_least_squares, case)),
+        "squares_numpy_gn": lambda: speed_peers.solve_by_gauss_newton(raw),
+        "squares_scipy": lambda: speed_peers.solve_by_scipy_least_squares(raw),
     }
-    worst: dict[str, Run] = {
-        "minimax": lambda: worst_target(case),
-        "minimax_slsqp": lambda: speed_peers.slsqp(raw, scale, size),
+    worst: dict[str, TimedRun] = {
+        "minimax": lambda: solve_minimax_over_targets(case),
+        "minimax_slsqp": lambda: speed_peers.solve_minimax_by_slsqp(raw, scale, size),
     }
-    if there("casadi"):
-        worst["minimax_ipopt"] = speed_peers.ipopt(raw, scale, size)
+    if is_peer_installed("casadi"):
+        worst["minimax_ipopt"] = speed_peers.build_ipopt_minimax_solver(raw, scale, size)
     split = replace(
         data, columns={**data.columns, "split": np.repeat(["train", "holdout"], [80, 20])}
     )
-    whole: dict[str, Run] = {
+    whole: dict[str, TimedRun] = {
         "whole": lambda: mc.calibrate(case.robot, split),
         "whole_beyond": lambda: mc.calibrate(case.robot, split).beyond,
-        "whole_without_numba": lambda: briefly(lambda: mc.calibrate(case.robot, split)),
+        "whole_without_numba": lambda: run_with_numpy_kernels(
+            lambda: mc.calibrate(case.robot, split)
+        ),
     }
     seconds = (
-        race(fits, repeats) | race(worst, 1 if quick else min(repeats, 5)) | race(whole, repeats)
+        time_runs_in_turn(fits, repeats)
+        | time_runs_in_turn(worst, 1 if quick else min(repeats, 5))
+        | time_runs_in_turn(whole, repeats)
     )
-    sums, ends = {"ours": float(case.model.cost(squares(case)).sum())}, {"ours": worst_target(case)}
+    sums, ends = (
+        {"ours": float(case.model.target_costs(solve_least_squares(case)).sum())},
+        {"ours": solve_minimax_over_targets(case)},
+    )
     for name in ("squares_numpy_gn", "squares_scipy"):
-        sums[name] = float((raw.rows(np.asarray(fits[name]()))[0] ** 2).sum())
+        sums[name] = float((raw.errors_and_jacobian(np.asarray(fits[name]()))[0] ** 2).sum())
     for name in worst.keys() - {"minimax"}:
-        ends[name] = float(raw.squares(np.asarray(worst[name]()))[0].max())
-    alike("least squares", sums)
-    alike("minimax", ends)
+        ends[name] = float(raw.target_mean_squares(np.asarray(worst[name]()))[0].max())
+    check_same_optimum("least squares", sums)
+    check_same_optimum("minimax", ends)
     return seconds
 
 
-def briefly(run: Run) -> object:
+def run_with_numpy_kernels(run: TimedRun) -> object:
     """A run with NumPy's kernels."""
-    with choice.work(brief=True):
+    with kernel_choice.use_numpy_kernels_for_brief_work(brief=True):
         return run()
 
 
-def there(package: str) -> bool:
+def is_peer_installed(package: str) -> bool:
     """Whether a peer is installed; a word where it is not."""
     found = find_spec(package) is not None
     if not found:
@@ -216,37 +244,44 @@ def there(package: str) -> bool:
     return found
 
 
-def points(seed: int, counts: tuple[int, ...]) -> dict[str, float]:
+def time_point_minimax(seed: int, point_counts: tuple[int, ...]) -> dict[str, float]:
     """Seconds of the worst point by the number of points, ours and by cones (of many, one run)."""
     out: dict[str, float] = {}
-    for count in counts:
-        case, data = case_of(count // 3, seed), simulated(count // 3, seed)
-        begin, kept = squares(case), measured_distances(data)
-        runs: dict[str, Run] = {f"point_{count}": lambda: worst_point(case, begin, kept)}  # noqa: B023
-        raw = raw_of(case, data)
-        if there("cvxpy"):
-            first = speed_peers.gauss_newton(raw)
+    for count in point_counts:
+        case, data = simulate_speed_case(count // 3, seed), simulate_measurements(count // 3, seed)
+        begin, kept = solve_least_squares(case), measured_distances(data)
+        runs: dict[str, TimedRun] = {
+            f"point_{count}": partial(solve_minimax_over_points, case, begin, kept)
+        }
+        raw = to_raw_arrays(case, data)
+        if is_peer_installed("cvxpy"):
+            first = speed_peers.solve_by_gauss_newton(raw)
             began = time.process_time()
-            end = raw.rows(speed_peers.cones(raw, first))[0]
+            end = raw.errors_and_jacobian(speed_peers.solve_point_minimax_by_cones(raw, first))[0]
             out[f"point_{count}_cvxpy"] = time.process_time() - began
             largest = float(np.sqrt((end**2).sum(axis=0)).max())
-            alike("worst point", {"ours": worst_point(case, begin, kept), "cvxpy": largest})
+            check_same_optimum(
+                "worst point",
+                {"ours": solve_minimax_over_points(case, begin, kept), "cvxpy": largest},
+            )
             if count <= 300:
-                runs[f"point_{count}_cvxpy"] = lambda: speed_peers.cones(raw, first)  # noqa: B023
-        out |= race(runs, 3)
+                runs[f"point_{count}_cvxpy"] = partial(
+                    speed_peers.solve_point_minimax_by_cones, raw, first
+                )
+        out |= time_runs_in_turn(runs, 3)
     return out
 
 
-def simulated(poses: int, seed: int) -> Measurements:
-    """The measurements of `case_of`."""
-    return simulate(load_robot("irb2600"), poses, 3, seed).data
+def simulate_measurements(pose_count: int, seed: int) -> Measurements:
+    """The measurements of `simulate_speed_case`."""
+    return simulate(load_robot("irb2600"), pose_count, 3, seed).data
 
 
-def command(seed: int) -> float:
+def time_calibrate_command(seed: int) -> float:
     """Processor time of `minimax-cal calibrate` on 100 poses, from the start of the process [s]."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "poses.csv"
-        mc.write_measurements(path, simulated(100, seed))
+        mc.write_measurements(path, simulate_measurements(100, seed))
         words = [sys.executable, "-m", "minimax_cal.cli", "calibrate", "irb2600", str(path)]
         times = []
         for _ in range(3):
@@ -258,30 +293,32 @@ def command(seed: int) -> float:
     return min(times)
 
 
-def plenty(poses: int, targets: int, seed: int) -> Measurements:
+def simulate_many_poses(pose_count: int, target_count: int, seed: int) -> Measurements:
     """Poses all over the joints' range, made part by part, for their making to take no memory."""
     robot, rng = load_robot("irb2600"), np.random.default_rng(seed)
-    arm = simulate(robot, 100, targets, seed).cell
-    q = random_joints(robot, (poses,), rng)
-    y = np.empty((poses, targets, 3))
-    for first in range(0, poses, 10000):
+    arm = simulate(robot, 100, target_count, seed).cell
+    q = random_joint_values(robot, (pose_count,), rng)
+    y = np.empty((pose_count, target_count, 3))
+    for first in range(0, pose_count, 10000):
         part = slice(first, first + 10000)
         y[part] = arm.predict(q[part])
-        y[part] += NOISE * rng.normal(size=y[part].shape)
+        y[part] += SPEED_COORDINATE_NOISE * rng.normal(size=y[part].shape)
     return mc.measurements(q, y)
 
 
-def calibrated_in(poses: int, targets: int, seed: int, answer: Any) -> None:
+def put_calibration_seconds_and_memory(
+    pose_count: int, target_count: int, seed: int, answer_queue: Any
+) -> None:
     """Put seconds and peak memory [GB] of one calibration; for a process of its own."""
-    data = plenty(poses, targets, seed)
-    mc.calibrate("irb2600", plenty(100, targets, seed))
+    data = simulate_many_poses(pose_count, target_count, seed)
+    mc.calibrate("irb2600", simulate_many_poses(100, target_count, seed))
     began = time.process_time()
     mc.calibrate("irb2600", data)
     spent = time.process_time() - began
-    answer.put((spent, peak_memory()))
+    answer_queue.put((spent, peak_memory_gb()))
 
 
-def peak_memory() -> float:
+def peak_memory_gb() -> float:
     """Of this process [GB]; what getrusage tells includes the parent's at the fork."""
     status = Path("/proc/self/status")
     if not status.exists():
@@ -290,7 +327,7 @@ def peak_memory() -> float:
     return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 1024**2
 
 
-def growth(
+def time_calibration_by_size(
     seed: int, sizes: tuple[tuple[int, int], ...]
 ) -> tuple[dict[str, float], dict[str, float]]:
     """Seconds and peak memory [GB] of a whole calibration by the number of poses and targets."""
@@ -298,7 +335,9 @@ def growth(
     seconds, memory = {}, {}
     for poses, targets in sizes:
         answer = fresh.SimpleQueue()
-        job = fresh.Process(target=calibrated_in, args=(poses, targets, seed, answer))
+        job = fresh.Process(
+            target=put_calibration_seconds_and_memory, args=(poses, targets, seed, answer)
+        )
         job.start()
         job.join()
         if job.exitcode:
@@ -308,10 +347,10 @@ def growth(
     return seconds, memory
 
 
-def bootstraps(seed: int) -> dict[str, float]:
+def time_bootstraps(seed: int) -> dict[str, float]:
     """Seconds of 500 replicates."""
-    robot, data = load_robot("irb2600"), simulated(100, seed)
-    return race(
+    robot, data = load_robot("irb2600"), simulate_measurements(100, seed)
+    return time_runs_in_turn(
         {
             f"bootstrap_500_{objective}": partial(
                 mc.bootstrap, mc.calibrate(robot, data, objective)
@@ -322,10 +361,12 @@ def bootstraps(seed: int) -> dict[str, float]:
     )
 
 
-def diagnoses(seed: int, sizes: tuple[tuple[int, int], ...]) -> dict[str, float]:
+def time_diagnoses_by_size(seed: int, sizes: tuple[tuple[int, int], ...]) -> dict[str, float]:
     """Seconds of a diagnosis by the number of poses and targets."""
     robot, out = load_robot("irb2600"), {}
-    mc.diagnose(robot, simulated(60, seed), quick=True)  # loads what is imported when it is used
+    mc.diagnose(
+        robot, simulate_measurements(60, seed), quick=True
+    )  # loads what is imported when it is used
     for poses, targets in sizes:
         more = simulate(robot, poses, targets, seed).data
         began = time.process_time()
@@ -334,12 +375,12 @@ def diagnoses(seed: int, sizes: tuple[tuple[int, int], ...]) -> dict[str, float]
     return out
 
 
-def diagnosis_like_real(seed: int) -> dict[str, float]:
+def time_real_like_diagnosis(seed: int) -> dict[str, float]:
     """Seconds of a diagnosis of 600 poses of an arm with many laws, whole and quick."""
     robot, out = load_robot("irb2600"), {}
     bare = simulate(robot, 600, 3, seed)
-    laws = Fitted.of((term, np.array(values)) for term, values in LAWS)
-    history = with_history(bare.data)
+    laws = Fitted.from_pairs((term, np.array(values)) for term, values in REAL_LIKE_EFFECT_TERMS)
+    history = add_history_columns(bare.data)
     moved = replace(bare.cell, effects=laws).follow(history) - bare.cell.follow(history)
     data = bare.data.with_y(bare.data.y + moved)
     for name, quick in (("like_real", False), ("like_real_quick", True)):
@@ -349,7 +390,7 @@ def diagnosis_like_real(seed: int) -> dict[str, float]:
     return out
 
 
-RATIOS = {  # name: the peer, ours, in words
+SPEED_RATIOS = {  # name: the peer, ours, in words
     "whole_over_slsqp": (
         "minimax_slsqp", "whole", "`mc.calibrate` as a whole against SLSQP's minimax alone"),
     "minimax_over_slsqp": (
@@ -368,7 +409,7 @@ RATIOS = {  # name: the peer, ours, in words
     "whole_without_numba_over_with": (
         "whole_without_numba", "whole", "`mc.calibrate` without numba"),
 }  # fmt: skip
-WORDS = {  # of times by name
+TIME_DESCRIPTIONS = {  # of times by name
     "squares": "least squares",
     "squares_without_numba": "the same without numba",
     "squares_numpy_gn": "plain Gauss-Newton in NumPy",
@@ -383,7 +424,7 @@ WORDS = {  # of times by name
     "diagnose_like_real": "a diagnosis of an arm with seven laws, 600 poses x 3 targets",
     "diagnose_like_real_quick": "the same, quick",
 }
-KINDS = (  # of times whose names have a size
+SIZED_TIME_DESCRIPTIONS = (  # of times whose names have a size
     (r"point_(\d+)", r"worst of \1 points, from the least squares"),
     (r"point_(\d+)_cvxpy", r"worst of \1 points by cvxpy"),
     (r"bootstrap_500_(\w+)", r"bootstrap of 500, \1"),
@@ -392,24 +433,24 @@ KINDS = (  # of times whose names have a size
 )
 
 
-def words_of(name: str) -> str:
+def describe_time(time_name: str) -> str:
     """What a time is of."""
-    for pattern, words in KINDS:
-        if found := re.fullmatch(pattern, name):
+    for pattern, words in SIZED_TIME_DESCRIPTIONS:
+        if found := re.fullmatch(pattern, time_name):
             return found.expand(words)
-    return WORDS[name]
+    return TIME_DESCRIPTIONS[time_name]
 
 
-def ratios(seconds: Mapping[str, float]) -> dict[str, float | None]:
+def peer_time_ratios(seconds: Mapping[str, float]) -> dict[str, float | None]:
     """The peers' times over ours; None for a peer that is not there."""
     return {
         name: seconds[peer] / seconds[ours] if peer in seconds else None
-        for name, (peer, ours, _) in RATIOS.items()
+        for name, (peer, ours, _) in SPEED_RATIOS.items()
         if ours in seconds
     }
 
 
-def timed(
+def time_all_parts(
     seed: int, repeats: int, parts: tuple[str, ...], *, quick: bool
 ) -> tuple[dict[str, float], dict[str, float]]:
     """Seconds of everything by name, and peak memory [GB] by poses x targets."""
@@ -418,41 +459,47 @@ def timed(
     sizes = ((1000, 3), (10000, 1)) if quick else ((1000, 3), (100000, 1), (1000000, 1))
     cases = ((100, 3),) if quick else ((100, 3), (600, 3), (1200, 1), (2000, 3))
     if "races" in parts:
-        seconds |= races(seed, 3 if quick else repeats, quick=quick)
+        seconds |= time_100_pose_fits(seed, 3 if quick else repeats, quick=quick)
     if "points" in parts:
-        seconds |= points(seed, (300, 3000) if quick else (300, 3000, 30000))
+        seconds |= time_point_minimax(seed, (300, 3000) if quick else (300, 3000, 30000))
     if "bootstrap" in parts:
-        seconds |= bootstraps(seed)
+        seconds |= time_bootstraps(seed)
     if "command" in parts:
-        seconds["command"] = command(seed)
+        seconds["command"] = time_calibrate_command(seed)
     if "growth" in parts:
-        grown, memory = growth(seed, sizes)
+        grown, memory = time_calibration_by_size(seed, sizes)
         seconds |= grown
     if "diagnosis" in parts:
-        seconds |= diagnoses(seed, cases)
-        seconds |= {} if quick else diagnosis_like_real(seed)
+        seconds |= time_diagnoses_by_size(seed, cases)
+        seconds |= {} if quick else time_real_like_diagnosis(seed)
     return seconds, memory
 
 
 @study_options("speed")
 @click.option("--repeats", type=int, default=9, show_default=True)
-@click.option("--part", multiple=True, type=click.Choice(PARTS), help="These alone  [default: all]")
+@click.option(
+    "--part", multiple=True, type=click.Choice(SPEED_PARTS), help="These alone  [default: all]"
+)
 def main(study: Study, repeats: int, part: tuple[str, ...]) -> None:
     """Ratios of our fits to their peers.
 
     Times are compared, so the runs go one after the other: --jobs and --cluster do not apply.
     """
     with threadpool_limits(1):
-        seconds, memory = timed(study.seed, repeats, part or PARTS, quick=study.quick)
-    over = ratios(seconds)
-    machine = f"{processor()}, kernels: {choice.kernels().__name__}"
-    numba = choice.kernels() is not plain
-    shown = tuple((f"`{k}`", math.nan if v is None else v, RATIOS[k][2]) for k, v in over.items())
-    spent = tuple((words_of(name), 1e3 * value) for name, value in seconds.items())
+        seconds, memory = time_all_parts(
+            study.seed, repeats, part or SPEED_PARTS, quick=study.quick
+        )
+    over = peer_time_ratios(seconds)
+    machine = f"{processor_name()}, kernels: {kernel_choice.active_kernels().__name__}"
+    numba = kernel_choice.active_kernels() is not plain
+    shown = tuple(
+        (f"`{k}`", math.nan if v is None else v, SPEED_RATIOS[k][2]) for k, v in over.items()
+    )
+    spent = tuple((describe_time(name), 1e3 * value) for name, value in seconds.items())
     tables = [
-        Table.made("the peer's time over ours", shown, "ratio | times .1f | of what"),
-        Table.made(f"processor time ({machine})", spent, "what | ms .2f"),
-        Table.made(
+        Table.from_rows("the peer's time over ours", shown, "ratio | times .1f | of what"),
+        Table.from_rows(f"processor time ({machine})", spent, "what | ms .2f"),
+        Table.from_rows(
             "peak memory of a whole calibration", memory.items(), "poses x targets | GB .2f"
         ),
     ]

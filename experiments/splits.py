@@ -17,24 +17,24 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.cluster.vq import kmeans2
 
-from experiments.conditions import ROBOTS, arm_of, robots_here
-from experiments.record import canvas
+from experiments.conditions import CONDITION_ROBOTS, list_available_robots, load_or_simulate_robot
+from experiments.study_record import new_figure
 from experiments.sweep import Study, study_options
+from minimax_cal.core.arrays import Array
+from minimax_cal.core.tables import Table
 from minimax_cal.fitting.calibrate import calibrate
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.measurements import Measurements
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-REGIONS = 6
-WAYS = ("random", "by groups")
-MEASURES = ("RMSE(phi)", "largest")
+REGIONS_PER_CLUSTERING = 6
+SPLIT_WAYS = ("random", "by groups")
+SPLIT_MEASURES = ("RMSE(phi)", "largest")
 
 
 @dataclass(frozen=True)
-class Job:
+class SplitJob:
     """One split of one robot.  train: training poses of a random one."""
 
     robot: str
@@ -45,7 +45,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Held:
+class HeldOutErrors:
     """Held-out RMSE(phi) and largest error, under sum and under minimax [mm]."""
 
     sum: tuple[float, float]
@@ -58,7 +58,7 @@ class Held:
         return first, second
 
 
-def regions(q: Array, seed: int) -> Array:
+def cluster_poses(q: Array, seed: int) -> Array:
     """(m,) the region of each pose: k-means on the joints, each measured by its spread.
 
     q: (m, n) [rad, m].
@@ -66,28 +66,30 @@ def regions(q: Array, seed: int) -> Array:
     spread = q.std(axis=0)
     points = q / np.where(spread > 0.0, spread, 1.0)
     centres = [points[np.random.default_rng(seed).integers(len(points))]]
-    while len(centres) < REGIONS:  # each next one as far as can be from those there are
+    while (
+        len(centres) < REGIONS_PER_CLUSTERING
+    ):  # each next one as far as can be from those there are
         apart = np.linalg.norm(points[:, None] - np.array(centres), axis=-1).min(axis=1)
         centres.append(points[apart.argmax()])
     _, label = kmeans2(points, np.array(centres), minit="matrix")
     return np.asarray(label)
 
 
-def held_rows(data: Measurements, job: Job) -> Array:
+def find_held_out_poses(data: Measurements, job: SplitJob) -> Array:
     """(m,) True where a pose is held out."""
     if job.way == "by groups":
-        clustering, region = divmod(job.split, REGIONS)
-        return np.asarray(regions(data.q, 1000 * job.seed + clustering) == region)
+        clustering, region = divmod(job.split, REGIONS_PER_CLUSTERING)
+        return np.asarray(cluster_poses(data.q, 1000 * job.seed + clustering) == region)
     order = np.random.default_rng([job.seed, job.split]).permutation(data.poses)
     held = np.ones(data.poses, dtype=bool)
     held[order[: job.train]] = False
     return held
 
 
-def run(job: Job) -> Held:
+def run_split(job: SplitJob) -> HeldOutErrors:
     """Calibrate both ways and judge on the poses held out."""
-    robot, data = arm_of(job.robot, job.seed + job.split)
-    held = held_rows(data, job)
+    robot, data = load_or_simulate_robot(job.robot, job.seed + job.split)
+    held = find_held_out_poses(data, job)
     out = {}
     for objective in ("sum", "minimax"):
         fit = calibrate(robot, data.take(~held), objective, holdout=0.0)
@@ -95,30 +97,33 @@ def run(job: Job) -> Held:
         distance = 1e3 * np.linalg.norm(some.y - fit.predict(some.q), axis=-1)
         phi = float(np.sqrt((distance**2).mean(axis=0).max()))
         out[objective] = (phi, float(distance.max()))
-    return Held(out["sum"], out["minimax"])
+    return HeldOutErrors(out["sum"], out["minimax"])
 
 
-def jobs_of(study: Study) -> list[Job]:
+def list_split_jobs(study: Study) -> list[SplitJob]:
     """Random splits and groups of every robot whose measurements are here."""
-    robots = robots_here()
+    robots = list_available_robots()
     count, clusterings = (2, 1) if study.quick else (24, 4)
-    number = {"random": count, "by groups": 2 if study.quick else clusterings * REGIONS}
+    number = {
+        "random": count,
+        "by groups": 2 if study.quick else clusterings * REGIONS_PER_CLUSTERING,
+    }
     return [
-        Job(name, way, split, ROBOTS[name][2], study.seed)
+        SplitJob(name, way, split, CONDITION_ROBOTS[name][2], study.seed)
         for name in (robots[:2] if study.quick else robots)
-        for way in WAYS
+        for way in SPLIT_WAYS
         for split in range(number[way])
     ]
 
 
-def study_of(study: Study) -> dict[Job, Held]:
+def run_all_cases(study: Study) -> dict[SplitJob, HeldOutErrors]:
     """Every split."""
-    jobs = jobs_of(study)
-    return dict(zip(jobs, study.sweep(run, jobs, "splits"), strict=True))
+    jobs = list_split_jobs(study)
+    return dict(zip(jobs, study.sweep(run_split, jobs, "splits"), strict=True))
 
 
 @dataclass(frozen=True)
-class Spread:
+class RatioSpread:
     """Ratios over splits: median, quartiles, and how often minimax wins."""
 
     median: float
@@ -128,35 +133,48 @@ class Spread:
     splits: int
 
 
-def spread_of(found: dict[Job, Held], robot: str, way: str, measure: int) -> Spread:
+def ratio_spread(
+    results: dict[SplitJob, HeldOutErrors], robot: str, way: str, measure: int
+) -> RatioSpread:
     """How minimax fares on one robot."""
-    ratio = ratios(found, robot, way, measure)
+    ratio = minimax_over_sum_ratios(results, robot, way, measure)
     low, median, high = (float(x) for x in np.quantile(ratio, (0.25, 0.5, 0.75)))
-    return Spread(median, low, high, int((ratio < 1.0).sum()), len(ratio))
+    return RatioSpread(median, low, high, int((ratio < 1.0).sum()), len(ratio))
 
 
-def ratios(found: dict[Job, Held], robot: str, way: str, measure: int) -> Array:
+def minimax_over_sum_ratios(
+    results: dict[SplitJob, HeldOutErrors], robot: str, way: str, measure: int
+) -> Array:
     """(splits,) minimax over sum."""
-    chosen = [held for job, held in found.items() if (job.robot, job.way) == (robot, way)]
+    chosen = [held for job, held in results.items() if (job.robot, job.way) == (robot, way)]
     return np.array([held.ratio[measure] for held in chosen])
 
 
-def robots_of(found: dict[Job, Held]) -> Sequence[str]:
+def list_studied_robots(results: dict[SplitJob, HeldOutErrors]) -> Sequence[str]:
     """The robots of a study."""
-    return list(dict.fromkeys(job.robot for job in found))
+    return list(dict.fromkeys(job.robot for job in results))
 
 
-def table_of(found: dict[Job, Held]) -> Table:
+def build_ratio_table(results: dict[SplitJob, HeldOutErrors]) -> Table:
     """Median, quartiles and wins."""
     rows = []
-    for robot in robots_of(found):
-        for way in WAYS:
-            for number, measure in enumerate(MEASURES):
-                s = spread_of(found, robot, way, number)
+    for robot in list_studied_robots(results):
+        for way in SPLIT_WAYS:
+            for number, measure in enumerate(SPLIT_MEASURES):
+                s = ratio_spread(results, robot, way, number)
                 rows.append(
-                    (ROBOTS[robot][0], way, measure, s.splits, s.median, s.low, s.high, s.wins)
+                    (
+                        CONDITION_ROBOTS[robot][0],
+                        way,
+                        measure,
+                        s.splits,
+                        s.median,
+                        s.low,
+                        s.high,
+                        s.wins,
+                    )
                 )
-    return Table.made(
+    return Table.from_rows(
         "minimax over sum on poses held out: below 1 minimax is better",
         rows,
         "robot | held out | measure | splits d | median .4f | lower quartile .4f | "
@@ -164,15 +182,15 @@ def table_of(found: dict[Job, Held]) -> Table:
     )
 
 
-def picture(found: dict[Job, Held]) -> Figure:
+def draw_ratio_boxes(results: dict[SplitJob, HeldOutErrors]) -> Figure:
     """All ratios of RMSE(phi)."""
-    rows = [(robot, way) for robot in robots_of(found) for way in WAYS]
-    figure = canvas(7.0, 0.5 * len(rows) + 1.2)
+    rows = [(robot, way) for robot in list_studied_robots(results) for way in SPLIT_WAYS]
+    figure = new_figure(7.0, 0.5 * len(rows) + 1.2)
     axes = figure.subplots()
     axes.boxplot(
-        [ratios(found, robot, way, 0) for robot, way in rows],
+        [minimax_over_sum_ratios(results, robot, way, 0) for robot, way in rows],
         orientation="horizontal",
-        tick_labels=[f"{ROBOTS[robot][0]}, {way}" for robot, way in rows],
+        tick_labels=[f"{CONDITION_ROBOTS[robot][0]}, {way}" for robot, way in rows],
     )
     axes.axvline(1.0, color="0.5", ls=":")
     axes.set(xlabel="held-out RMSE(phi), minimax over sum")
@@ -180,13 +198,13 @@ def picture(found: dict[Job, Held]) -> Figure:
     return figure
 
 
-def save(study: Study, found: dict[Job, Held]) -> None:
+def save_results(study: Study, results: dict[SplitJob, HeldOutErrors]) -> None:
     """Table and picture."""
-    table = table_of(found)
-    study.save([table], {"rows": table.records()}, {"splits": picture(found)})
+    table = build_ratio_table(results)
+    study.save([table], {"rows": table.to_records()}, {"splits": draw_ratio_boxes(results)})
 
 
 @study_options("splits")
 def main(study: Study) -> None:
     """Minimax against the sum over many splits, at random and by groups."""
-    save(study, study_of(study))
+    save_results(study, run_all_cases(study))

@@ -40,21 +40,21 @@ from rich.progress import track
 
 import minimax_cal
 import qp_backends
-from experiments.record import (
-    commit,
-    environment,
-    run_record,
-    save_figure,
-    save_json,
-    save_tables,
-    table_record,
+from experiments.study_record import (
+    build_environment_table,
+    build_run_record,
+    current_commit,
+    table_to_json,
+    write_figure_files,
+    write_json,
+    write_tables,
 )
-from minimax_cal.ground import parallel
-from minimax_cal.ground.errors import CalibrationError, OptionError
-from minimax_cal.ground.files import write_whole
-from minimax_cal.ground.optional import optional
-from minimax_cal.ground.parallel import WorkersLost
-from minimax_cal.ground.tables import Table
+from minimax_cal.core import parallel
+from minimax_cal.core.errors import CalibrationError, OptionError
+from minimax_cal.core.files import write_file_atomically
+from minimax_cal.core.optional_packages import import_optional
+from minimax_cal.core.parallel import WorkersLostError
+from minimax_cal.core.tables import Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -62,19 +62,32 @@ if TYPE_CHECKING:
 J = TypeVar("J")
 R = TypeVar("R")
 
-CACHE = Path("results/cache")
-LIBRARIES = tuple(Path(package.__path__[0]) for package in (minimax_cal, qp_backends))
-SOLVERS = ("daqp", "osqp", "clarabel", "proxsuite", "quadprog", "piqp", "highspy", "scs")
-NUMERICS = ("numpy", "scipy", "qpsolvers", "cvxpy", *SOLVERS)
-OF_ARRAYS = {
+RESULT_CACHE_FOLDER = Path("results/cache")
+LIBRARY_FOLDERS = tuple(Path(package.__path__[0]) for package in (minimax_cal, qp_backends))
+SOLVER_PACKAGES = ("daqp", "osqp", "clarabel", "proxsuite", "quadprog", "piqp", "highspy", "scs")
+NUMERICAL_PACKAGES = ("numpy", "scipy", "qpsolvers", "cvxpy", *SOLVER_PACKAGES)
+ALLOWED_ARRAY_PICKLE_NAMES = {
     *itertools.product(("numpy._core.multiarray",), ("_reconstruct", "scalar")),
     *itertools.product(("numpy.core.multiarray",), ("_reconstruct", "scalar")),
     *itertools.product(("numpy._core.numeric", "numpy.core.numeric"), ("_frombuffer",)),
     *itertools.product(("numpy",), ("ndarray", "dtype")),
     *itertools.product(("pathlib",), ("PosixPath", "WindowsPath")),
 }
-NO_FIGURE = ("out", "json", "jobs", "cluster", "fresh")  # options that decide no figure
-OUTPUT = {"__init__", "__main__", "index", "pages", "record", "sweep"}  # files that shape no result
+OPTIONS_WITHOUT_EFFECT_ON_RESULTS = (
+    "out",
+    "json",
+    "jobs",
+    "cluster",
+    "fresh",
+)  # options that decide no figure
+OUTPUT_MODULE_NAMES = {
+    "__init__",
+    "__main__",
+    "index",
+    "pages",
+    "record",
+    "sweep",
+}  # files that shape no result
 
 
 def sweep(
@@ -85,7 +98,7 @@ def sweep(
     description: str = "",
     jobs_in_parallel: int = -1,
     cluster: str = "",
-    folder: Path = CACHE,
+    folder: Path = RESULT_CACHE_FOLDER,
     fresh: bool = False,
 ) -> list[R]:
     """The function's result for each job, in the order of the jobs.
@@ -96,22 +109,24 @@ def sweep(
     Raises OptionError for what a user can mend.
     """
     if "<" in function.__qualname__ or function.__module__ == "__main__":
-        raise TypeError(f"{function.__qualname__} must be at the top of a module; see `start`")
+        raise TypeError(
+            f"{function.__qualname__} must be at the top of a module; see `run_study_file`"
+        )
     if jobs_in_parallel == 0:
         raise OptionError("--jobs 0: give the number of processes, or -1 for one a core")
-    code = fingerprint(function)
-    paths = [folder / name / f"{key(name, function, job, code)}.part" for job in jobs]
-    kept = [[] if fresh else read_part(path) for path in paths]
+    code = code_fingerprint(function)
+    paths = [folder / name / f"{result_cache_key(name, function, job, code)}.part" for job in jobs]
+    kept = [[] if fresh else read_cached_result(path) for path in paths]
     results: dict[int, R] = {number: found[0] for number, found in enumerate(kept) if found}
     if results:
         click.echo(f"{name}: {len(results)} of {len(jobs)} parts were kept", err=True)
     waiting = [number for number in range(len(jobs)) if number not in results]
     calls = [(function, jobs[number], code if cluster else "") for number in waiting]
     try:
-        with closing(run(calls, jobs_in_parallel, cluster, description or name)) as arriving:
+        with closing(run_calls(calls, jobs_in_parallel, cluster, description or name)) as arriving:
             for at, result in arriving:
                 number = waiting[at]
-                write_part(paths[number], result)
+                write_cached_result(paths[number], result)
                 results[number] = result
     finally:
         if len(results) < len(jobs):
@@ -120,12 +135,12 @@ def sweep(
     return [results[number] for number in range(len(jobs))]
 
 
-Call = tuple[Callable[..., Any], Any, str]  # what `part` takes
+Call = tuple[Callable[..., Any], Any, str]  # what `run_job_with_code_check` takes
 
 
-def part(function: Callable[[J], R], job: J, code: str) -> R:
+def run_job_with_code_check(function: Callable[[J], R], job: J, expected_fingerprint: str) -> R:
     """One job where it runs; code, if any, is the fingerprint that it must find there."""
-    if code and fingerprint(function) != code:
+    if expected_fingerprint and code_fingerprint(function) != expected_fingerprint:
         raise OptionError(
             "a worker of the cluster runs other code or other versions of numpy, scipy or the QP "
             "solvers; bring it to the state of this machine and start it again"
@@ -133,7 +148,7 @@ def part(function: Callable[[J], R], job: J, code: str) -> R:
     return function(job)
 
 
-def progress(items: Iterator[R], total: int, description: str) -> Iterator[R]:
+def track_progress(items: Iterator[R], total: int, description: str) -> Iterator[R]:
     """The same items, with a bar and the time left on stderr if that is a terminal."""
     console = Console(stderr=True)
     off = not console.is_terminal
@@ -143,29 +158,33 @@ def progress(items: Iterator[R], total: int, description: str) -> Iterator[R]:
 # ---- where jobs run --------------------------------------------------------------------------
 
 
-def run(
+def run_calls(
     calls: Sequence[Call], jobs_in_parallel: int, cluster: str, description: str
 ) -> Generator[tuple[int, Any], None, None]:
-    """The number of each call of `part` and its result, in the order they finish."""
+    """The number of each call of `run_job_with_code_check` and its result, in the order they
+    finish.
+    """
     if not calls:
         return
     modules = [calls[0][0].__module__]
-    work = in_parallel(part, calls, modules, processes=jobs_in_parallel, cluster=cluster)
+    work = run_calls_in_parallel(
+        run_job_with_code_check, calls, modules, processes=jobs_in_parallel, cluster=cluster
+    )
     try:
         with closing(work):
-            yield from progress(work, len(calls), description)
-    except WorkersLost as error:
+            yield from track_progress(work, len(calls), description)
+    except WorkersLostError as error:
         raise click.ClickException(str(error)) from error
 
 
-def in_parallel(
+def run_calls_in_parallel(
     function: Callable[..., Any],
     calls: Sequence[tuple[Any, ...]],
     modules: Iterable[str] = (),
     *,
     processes: int = -1,
     cluster: str = "",
-) -> parallel.Numbered:
+) -> parallel.IndexedResults:
     """The number of each call and its result, in the order they finish.
 
     function: at the top of a module.  calls: the arguments of each.  processes: on this machine,
@@ -176,26 +195,30 @@ def in_parallel(
         return
     work = [(function, number, call) for number, call in enumerate(calls)]
     needed = {parallel.__name__, function.__module__, *modules}
-    arriving = parallel.on_cluster(work, cluster, needed) if cluster else here(work, processes)
+    arriving = (
+        parallel.run_on_cluster(work, cluster, needed)
+        if cluster
+        else run_by_joblib(work, processes)
+    )
     with closing(arriving):
         yield from arriving
 
 
-def here(work: parallel.Work, processes: int) -> parallel.Numbered:
+def run_by_joblib(work: parallel.Tasks, processes: int) -> parallel.IndexedResults:
     """By joblib in processes of one thread each on this machine."""
     if processes == 0:
         raise OptionError("0 processes: give their number, or -1 for one a core")
-    joblib = optional("joblib", "work in several processes", parallel.JOBLIB)
-    while parallel.PLAIN:  # joblib would take it for a pool of its own
-        parallel.PLAIN.pop().shutdown(wait=True)
+    joblib = import_optional("joblib", "work in several processes", parallel.JOBLIB_REQUIREMENT)
+    while parallel.REUSED_PROCESS_POOL:  # joblib would take it for a pool of its own
+        parallel.REUSED_PROCESS_POOL.pop().shutdown(wait=True)
     with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
         pool = joblib.Parallel(n_jobs=processes, return_as="generator_unordered")
-        arriving = pool(joblib.delayed(parallel.numbered)(*each) for each in work)
+        arriving = pool(joblib.delayed(parallel.call_with_index)(*each) for each in work)
         loky = import_module("joblib.externals.loky.process_executor")
         try:
             yield from arriving
         except loky.BrokenProcessPool as error:
-            raise WorkersLost(
+            raise WorkersLostError(
                 "a process died: too little memory, or it was killed; start fewer at once "
                 f"({type(error).__name__})"
             ) from error
@@ -205,32 +228,32 @@ def here(work: parallel.Work, processes: int) -> parallel.Numbered:
                 arriving.close()
 
 
-def needed(module: str, extra: str) -> Any:
+def import_optional_module(module: str, extra: str) -> Any:
     """An optional module.  Raises OptionError with the command that installs it."""
-    return optional(module, "this", f"minimax-cal[{extra}]")
+    return import_optional(module, "this", f"minimax-cal[{extra}]")
 
 
 # ---- what is kept ----------------------------------------------------------------------------
 
 
-def key(name: str, function: Callable[..., Any], job: object, code: str) -> str:
+def result_cache_key(name: str, function: Callable[..., Any], job: object, code: str) -> str:
     """Names a result by all that it depends on."""
-    joblib = needed("joblib", "experiments")
+    joblib = import_optional_module("joblib", "experiments")
     return str(joblib.hash((name, function.__module__, function.__qualname__, job, code)))
 
 
-def read_part(path: Path) -> list[Any]:
+def read_cached_result(path: Path) -> list[Any]:
     """[result], or [] where there is none, it is damaged or holds more than data."""
     try:
         digest, content = path.read_bytes().split(b"\n", 1)
         if digest.decode() != hashlib.sha256(content).hexdigest():
             return []
-        return [DataOnly(io.BytesIO(content)).load()]
+        return [DataOnlyUnpickler(io.BytesIO(content)).load()]
     except Exception:  # whatever is wrong with a kept part, it can be computed again
         return []
 
 
-class DataOnly(pickle.Unpickler):
+class DataOnlyUnpickler(pickle.Unpickler):
     """Loads what results are made of: data classes, enumerations, paths, arrays; no function.
 
     The digest of a part finds damage, not malice: a part may come from anywhere.
@@ -238,7 +261,7 @@ class DataOnly(pickle.Unpickler):
 
     def find_class(self, module: str, name: str) -> Any:
         """A class that holds data, or what NumPy makes arrays of.  Raises UnpicklingError."""
-        if (module, name) in OF_ARRAYS:
+        if (module, name) in ALLOWED_ARRAY_PICKLE_NAMES:
             return super().find_class(module, name)
         found = getattr(sys.modules.get(module), name, None)  # nothing is imported for it
         holds = isinstance(found, type) and (
@@ -249,45 +272,49 @@ class DataOnly(pickle.Unpickler):
         return found
 
 
-def write_part(path: Path, result: object) -> None:
+def write_cached_result(path: Path, result: object) -> None:
     """Keep a result: whole, or not at all.  Raises UnpicklingError for what is not data."""
     path.parent.mkdir(parents=True, exist_ok=True)
     content = pickle.dumps(result, protocol=pickle.HIGHEST_PROTOCOL)
-    DataOnly(io.BytesIO(content)).load()  # else it would be computed again and again
-    write_whole(path, hashlib.sha256(content).hexdigest().encode() + b"\n" + content)
+    DataOnlyUnpickler(io.BytesIO(content)).load()  # else it would be computed again and again
+    write_file_atomically(path, hashlib.sha256(content).hexdigest().encode() + b"\n" + content)
 
 
-def fingerprint(function: Callable[..., Any]) -> str:
+def code_fingerprint(function: Callable[..., Any]) -> str:
     """Digest of the libraries, of the study's own files and of the packages that compute.
 
     A study's files are the one with the function and those beside it that it imports.
     """
-    files = library_files() + study_files(Path(inspect.getfile(function)))
-    parts = [f"{path.name} {file_digest(path)}" for path in files] + versions()
+    files = list_library_files() + list_study_files(Path(inspect.getfile(function)))
+    parts = [f"{path.name} {file_digest(path)}" for path in files] + list_package_versions()
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
 
 @functools.cache
-def library_files() -> tuple[Path, ...]:
+def list_library_files() -> tuple[Path, ...]:
     """Code and robots of our packages."""
-    files = [path for folder in LIBRARIES for path in sorted(folder.rglob("*"))]
+    files = [path for folder in LIBRARY_FOLDERS for path in sorted(folder.rglob("*"))]
     return tuple(path for path in files if path.suffix in (".py", ".json"))
 
 
 @functools.cache
-def study_files(path: Path) -> tuple[Path, ...]:
+def list_study_files(path: Path) -> tuple[Path, ...]:
     """The file and those in its folder that it imports, directly or not."""
     found: set[Path] = set()
     waiting = [path]
     while waiting:
         here = waiting.pop()
-        if here not in found and (here == path or here.stem not in OUTPUT) and here.exists():
+        if (
+            here not in found
+            and (here == path or here.stem not in OUTPUT_MODULE_NAMES)
+            and here.exists()
+        ):
             found.add(here)
-            waiting += [here.with_name(f"{name}.py") for name in imported(here)]
+            waiting += [here.with_name(f"{name}.py") for name in list_imported_names(here)]
     return tuple(sorted(found))
 
 
-def imported(path: Path) -> set[str]:
+def list_imported_names(path: Path) -> set[str]:
     """Every part of every dotted name that a file imports."""
     names: list[str] = []
     for node in ast.walk(ast.parse(path.read_bytes())):
@@ -304,10 +331,10 @@ def file_digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def versions() -> list[str]:
+def list_package_versions() -> list[str]:
     """The packages whose numbers end in results."""
     found = []
-    for package in NUMERICS:
+    for package in NUMERICAL_PACKAGES:
         with suppress(PackageNotFoundError):
             found.append(f"{package} {version(package)}")
     return found
@@ -359,16 +386,16 @@ class Study:
         packages: whose versions matter besides the usual ones.
         """
         packages = tuple(packages)
-        save_tables(self.out, self.name, [*tables, environment(packages)])
+        write_tables(self.out, self.name, [*tables, build_environment_table(packages)])
         for name, figure in (figures or {}).items():
-            save_figure(self.out, name, figure)
+            write_figure_files(self.out, name, figure)
         if self.json:
-            made = run_record(self.command, packages)
-            records = [table_record(table) for table in tables]
-            save_json(self.json, {**content, "made": made, "tables": records})
+            made = build_run_record(self.command, packages)
+            records = [table_to_json(table) for table in tables]
+            write_json(self.json, {**content, "made": made, "tables": records})
 
 
-class Misuse(click.ClickException):
+class StudyMisuse(click.ClickException):
     """A user's mistake, shown in one line."""
 
     exit_code = 2
@@ -398,23 +425,25 @@ def study_options(name: str) -> Callable[[Callable[..., None]], click.Command]:
             "--jobs", type=int, default=-1, show_default=True, help="Processes; -1: one a core."
         ),
         click.option("--cluster", default="", help="Dask scheduler to run on: tcp://host:port."),
-        click.option("--fresh", is_flag=True, help=f"Use no results kept in {CACHE}."),
+        click.option(
+            "--fresh", is_flag=True, help=f"Use no results kept in {RESULT_CACHE_FOLDER}."
+        ),
     )
     fields = tuple(field.name for field in dataclasses.fields(Study))[1:-1]
 
     def decorate(function: Callable[..., None]) -> click.Command:
         if function.__module__ == "__main__" and Path(inspect.getfile(function)).stem == name:
-            start(inspect.getfile(function))
+            run_study_file(inspect.getfile(function))
 
         @functools.wraps(function)
         def command(**given: Any) -> None:
-            commit()  # as it is now: a long run may see the next one
-            words = command_of(name, click.get_current_context())
+            current_commit()  # as it is now: a long run may see the next one
+            words = format_study_command(name, click.get_current_context())
             study = Study(name, **{field: given.pop(field) for field in fields}, command=words)
             try:
                 function(study, **given)
             except (CalibrationError, qp_backends.BackendError) as error:
-                raise Misuse(str(error)) from error
+                raise StudyMisuse(str(error)) from error
 
         for option in reversed(options):
             command = option(command)
@@ -423,12 +452,15 @@ def study_options(name: str) -> Callable[[Callable[..., None]], click.Command]:
     return decorate
 
 
-def command_of(name: str, context: click.Context) -> str:
+def format_study_command(name: str, context: click.Context) -> str:
     """The words that run a study again to the same figures, from the options that were given."""
     words = ["python", "-m", "experiments", name]
     for option in context.command.params:
         source = context.get_parameter_source(option.name or "")
-        if source != ParameterSource.COMMANDLINE or option.name in NO_FIGURE:
+        if (
+            source != ParameterSource.COMMANDLINE
+            or option.name in OPTIONS_WITHOUT_EFFECT_ON_RESULTS
+        ):
             continue
         value = context.params[option.name]
         if getattr(option, "is_flag", False):
@@ -439,7 +471,7 @@ def command_of(name: str, context: click.Context) -> str:
     return shlex.join(words)
 
 
-def start(file: str) -> None:
+def run_study_file(file: str) -> None:
     """Run the study in this file as ``python -m`` found it.
 
     The module is imported under its own name, since nothing of ``__main__`` reaches a cluster.

@@ -5,19 +5,45 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from minimax_cal.ground.tables import Table
+from minimax_cal.core.tables import Table
 
-HEADER = ("item", "command", "paper", "ours", "verdict", "remark", "claims", "held", "failed")
-HOLDS, YES, PARTLY, NO = "holds", "reproduced", "reproduced in part", "not reproduced"
-MISSING = "not covered"  # for want of hardware, which the remark names
-TOO_FEW = "too few to say"  # of a quick run, or where nothing could be asked
-VERDICTS = (HOLDS, YES, PARTLY, NO, MISSING, TOO_FEW)
-ENOUGH = 20  # starts, splits or arms that a quick run needs for a verdict on them
-NEAR = 0.25  # of the printed figure, both ways, that counts as reproducing it
+VERDICT_COLUMNS = (
+    "item",
+    "command",
+    "paper",
+    "ours",
+    "verdict",
+    "remark",
+    "claims",
+    "held",
+    "failed",
+)
+HOLDS_VERDICT, REPRODUCED_VERDICT, PARTLY_REPRODUCED_VERDICT, NOT_REPRODUCED_VERDICT = (
+    "holds",
+    "reproduced",
+    "reproduced in part",
+    "not reproduced",
+)
+NOT_COVERED_VERDICT = "not covered"  # for want of hardware, which the remark names
+TOO_FEW_VERDICT = "too few to say"  # of a quick run, or where nothing could be asked
+ALL_VERDICTS = (
+    HOLDS_VERDICT,
+    REPRODUCED_VERDICT,
+    PARTLY_REPRODUCED_VERDICT,
+    NOT_REPRODUCED_VERDICT,
+    NOT_COVERED_VERDICT,
+    TOO_FEW_VERDICT,
+)
+MIN_CASES_OF_QUICK_VERDICT = (
+    20  # starts, splits or arms that a quick run needs for a verdict on them
+)
+MAX_RELATIVE_DIFFERENCE_FROM_PAPER = (
+    0.25  # of the printed figure, both ways, that counts as reproducing it
+)
 
 
 @dataclass(frozen=True)
-class Claim:
+class PaperClaim:
     """A statement of a paper about one figure, and whether the figure of this run bears it out."""
 
     text: str
@@ -25,8 +51,8 @@ class Claim:
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """A line; the verdict follows from its claims by one rule, that of `verdict_of`.
+class PaperVerdict:
+    """A line; the verdict follows from its claims by one rule, that of `verdict_from_claims`.
 
     command: the study that prints ours.  paper, ours: figures in words.  claims: one for each
     figure, arm or method that the item speaks of.  exact: a formula, which holds or does not.
@@ -38,7 +64,7 @@ class Verdict:
     command: str
     paper: str
     ours: str
-    claims: tuple[Claim, ...] = ()
+    claims: tuple[PaperClaim, ...] = ()
     remark: str = ""
     cases: int = 0
     exact: bool = False
@@ -46,16 +72,23 @@ class Verdict:
 
     @property
     def verdict(self) -> str:
-        """One of `VERDICTS`."""
+        """One of `ALL_VERDICTS`."""
         if self.command == "-":
-            return MISSING
-        if self.quick and 0 < self.cases < ENOUGH:
-            return TOO_FEW
-        found = verdict_of(self.claims)
-        return {YES: HOLDS, PARTLY: NO}.get(found, found) if self.exact else found
+            return NOT_COVERED_VERDICT
+        if self.quick and 0 < self.cases < MIN_CASES_OF_QUICK_VERDICT:
+            return TOO_FEW_VERDICT
+        found = verdict_from_claims(self.claims)
+        return (
+            {
+                REPRODUCED_VERDICT: HOLDS_VERDICT,
+                PARTLY_REPRODUCED_VERDICT: NOT_REPRODUCED_VERDICT,
+            }.get(found, found)
+            if self.exact
+            else found
+        )
 
-    def cells(self) -> tuple[str, ...]:
-        """A row under `HEADER`."""
+    def to_table_row(self) -> tuple[str, ...]:
+        """A row under `VERDICT_COLUMNS`."""
         held, failed = (
             "; ".join(claim.text for claim in self.claims if claim.holds == which)
             for which in (True, False)
@@ -66,34 +99,44 @@ class Verdict:
                 held, failed)  # fmt: skip
 
 
-def verdict_of(claims: Sequence[Claim]) -> str:
+def verdict_from_claims(claims: Sequence[PaperClaim]) -> str:
     """Reproduced: all claims hold; in part: more than half; not: no more than half."""
     if not claims:
-        return TOO_FEW
+        return TOO_FEW_VERDICT
     held = sum(claim.holds for claim in claims)
-    return YES if held == len(claims) else PARTLY if 2 * held > len(claims) else NO
+    return (
+        REPRODUCED_VERDICT
+        if held == len(claims)
+        else PARTLY_REPRODUCED_VERDICT
+        if 2 * held > len(claims)
+        else NOT_REPRODUCED_VERDICT
+    )
 
 
-def by_name(text: str, pairs: Iterable[tuple[str, bool]]) -> tuple[Claim, ...]:
+def build_claims_by_name(text: str, pairs: Iterable[tuple[str, bool]]) -> tuple[PaperClaim, ...]:
     """A claim for each pair of a name, which replaces {} in the text, and whether it holds."""
-    return tuple(Claim(text.format(name), bool(holds)) for name, holds in pairs)
+    return tuple(PaperClaim(text.format(name), bool(holds)) for name, holds in pairs)
 
 
-def near(ours: float, printed: float, share: float = NEAR) -> bool:
+def is_near_printed_figure(
+    ours: float, printed: float, max_relative_difference: float = MAX_RELATIVE_DIFFERENCE_FROM_PAPER
+) -> bool:
     """Whether a figure is within a share of the printed one, both ways."""
-    return abs(ours / printed - 1.0) <= share
+    return abs(ours / printed - 1.0) <= max_relative_difference
 
 
-def listed(values: Iterable[float], form: str = ".2f") -> str:
+def join_values(values: Iterable[float], form: str = ".2f") -> str:
     """As 1.00 / 2.00."""
     return " / ".join(format(value, form) for value in values)
 
 
-def hardware(item: str, paper: str, needs: str) -> Verdict:
+def verdict_for_missing_hardware(item: str, paper: str, needs: str) -> PaperVerdict:
     """What cannot be covered without a machine that we have not got."""
-    return Verdict(item, "-", paper, "-", remark=f"hardware we lack: {needs}")
+    return PaperVerdict(item, "-", paper, "-", remark=f"hardware we lack: {needs}")
 
 
-def table_of(verdicts: Sequence[Verdict]) -> Table:
+def build_verdicts_table(verdicts: Sequence[PaperVerdict]) -> Table:
     """All verdicts, each with the claims that held and that failed."""
-    return Table("the two papers, item by item", HEADER, tuple(v.cells() for v in verdicts))
+    return Table(
+        "the two papers, item by item", VERDICT_COLUMNS, tuple(v.to_table_row() for v in verdicts)
+    )

@@ -17,33 +17,33 @@ from functools import partial
 import numpy as np
 
 from experiments import algorithm_1
-from experiments.conditions import ROBOTS, arm_of, robots_here
-from experiments.speed import fitted
+from experiments.conditions import CONDITION_ROBOTS, list_available_robots, load_or_simulate_robot
+from experiments.speed import fit_least_squares
 from experiments.sweep import Study, study_options
+from minimax_cal.core.arrays import Array
+from minimax_cal.core.tables import Table
+from minimax_cal.fitting.cell_fit import FIT_QP_TOLERANCE
 from minimax_cal.fitting.minimax_problem import (
-    Distances,
     MinimaxProblem,
+    TargetDistanceLimits,
+    build_minimax_problem,
     measured_distances,
-    minimax_problem,
 )
-from minimax_cal.fitting.solve import QP_TOLERANCE
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.tables import Table
-from minimax_cal.measuring.grouping import split
-from minimax_cal.modelling.model import Model
-from minimax_cal.modelling.parameters import State
+from minimax_cal.measuring.pose_groups import split_train_and_holdout
+from minimax_cal.modelling.parameters import ParameterValues
+from minimax_cal.modelling.point_model import PointModel
 from minimax_cal.solvers import minimax
 from minimax_cal.solvers.epigraph_qp import ignore_warm_start
 from minimax_cal.solvers.linearisation import Linearisation
 from qp_backends import solve as solve_qp
 
-SOLVE = ignore_warm_start(partial(solve_qp, name="daqp", tolerance=QP_TOLERANCE))
-STEPS = 10  # of Algorithm 1
-FREE, BOUND = "without", "c(x) <= 0"
+DAQP_SOLVER = ignore_warm_start(partial(solve_qp, name="daqp", tolerance=FIT_QP_TOLERANCE))
+ALGORITHM_1_STEPS = 10  # of Algorithm 1
+WITHOUT_CONSTRAINT, WITH_CONSTRAINT = "without", "c(x) <= 0"
 
 
 @dataclass(frozen=True, eq=False)
-class SumProblem:
+class SumOfSquaresProblem:
     """min over x of the mean square of all points, the distances kept [paper M, eq. 32].
 
     Its epigraph QP with the Gauss-Newton curvature is the step of constrained Gauss-Newton.
@@ -63,12 +63,12 @@ class SumProblem:
         """(l,) of the constraints."""
         return self.problem.upper
 
-    def evaluate(self, x: State) -> tuple[Array, Array]:
+    def evaluate(self, x: ParameterValues) -> tuple[Array, Array]:
         """The mean square (1,), and the constraints (l,)."""
         f, c = self.problem.evaluate(x)
         return np.array([self.share @ f]), c
 
-    def linearise(self, x: State) -> Linearisation:
+    def linearise(self, x: ParameterValues) -> Linearisation:
         """The same with derivatives."""
         at = self.problem.linearise(x)
         return Linearisation(
@@ -79,13 +79,13 @@ class SumProblem:
             curvature=lambda weights: at.curvature(weights[0] * self.share),
         )
 
-    def step(self, x: State, d: Array) -> State:
+    def step(self, x: ParameterValues, d: Array) -> ParameterValues:
         """The state moved by a scaled step."""
         return self.problem.step(x, d)
 
 
 @dataclass(frozen=True)
-class Job:
+class WarmStartJob:
     """An arm of Table 3."""
 
     robot: str
@@ -93,7 +93,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Start:
+class WarmStart:
     """A fit of the sum, and what begins there.
 
     sums: F_i [m^2].  phi: RMSE(φ) [m].  worst: the largest |distance - measured| over sqrt(ε).
@@ -109,38 +109,51 @@ class Start:
     letter: tuple[float, ...]
 
 
-def run(job: Job) -> dict[str, Start]:
+def run_arm(job: WarmStartJob) -> dict[str, WarmStart]:
     """The fits of one arm by name."""
-    robot, data = arm_of(job.robot, job.seed)
-    train, _, _ = split(data, 1.0 - ROBOTS[job.robot][2] / data.poses, job.seed)
-    model, free = fitted(robot, train)
+    robot, data = load_or_simulate_robot(job.robot, job.seed)
+    train, _, _ = split_train_and_holdout(
+        data, 1.0 - CONDITION_ROBOTS[job.robot][2] / data.poses, job.seed
+    )
+    model, free = fit_least_squares(robot, train)
     distances = measured_distances(train)
-    bound = constrained_fit(model, free, distances)
+    bound = fit_sum_with_constraint(model, free, distances)
     return {
-        FREE: start_of(model, free, "converged", distances),
-        BOUND: start_of(model, bound.x, str(bound.status), distances),
+        WITHOUT_CONSTRAINT: evaluate_warm_start(model, free, "converged", distances),
+        WITH_CONSTRAINT: evaluate_warm_start(model, bound.x, str(bound.status), distances),
     }
 
 
-def constrained_fit(model: Model, x: State, distances: Distances) -> minimax.Optimum[State]:
+def fit_sum_with_constraint(
+    model: PointModel, x: ParameterValues, distances: TargetDistanceLimits
+) -> minimax.Optimum[ParameterValues]:
     """Eq. 32 from a start, by constrained Gauss-Newton."""
-    problem = minimax_problem(model, x, distances, "two-sided", "target")
-    return minimax.solve(SumProblem(problem, model.counts / model.counts.sum()), x, SOLVE)
+    problem = build_minimax_problem(model, x, distances, "two-sided", "target")
+    return minimax.solve(
+        SumOfSquaresProblem(
+            problem, model.pose_counts_by_target / model.pose_counts_by_target.sum()
+        ),
+        x,
+        DAQP_SOLVER,
+    )
 
 
-def start_of(model: Model, x: State, status: str, distances: Distances) -> Start:
+def evaluate_warm_start(
+    model: PointModel, x: ParameterValues, status: str, distances: TargetDistanceLimits
+) -> WarmStart:
     """A fit, and what begins there.  distances: those that the minimax keeps."""
-    problem = minimax_problem(model, x, distances, "two-sided", "target")
-    best = minimax.solve(problem, x, SOLVE).value * problem.size
-    printed = minimax_problem(model, x, distances, "squared", "target")
+    problem = build_minimax_problem(model, x, distances, "two-sided", "target")
+    best = minimax.solve(problem, x, DAQP_SOLVER).value * problem.size
+    printed = build_minimax_problem(model, x, distances, "squared", "target")
     ends = [
-        algorithm_1.algorithm_1(printed, x, STEPS, search=search)[-1] * printed.size
-        for search in algorithm_1.WAYS.values()
+        algorithm_1.run_algorithm_1(printed, x, ALGORITHM_1_STEPS, with_line_search=search)[-1]
+        * printed.size
+        for search in algorithm_1.ALGORITHM_1_VARIANTS.values()
     ]
-    sums, apart = model.cost(x), problem.distance(x)[0]
-    return Start(
+    sums, apart = model.target_costs(x), problem.distance_values_and_jacobian(x)[0]
+    return WarmStart(
         sums=tuple(sums.tolist()),
-        phi=float(np.sqrt((sums / model.counts).max())),
+        phi=float(np.sqrt((sums / model.pose_counts_by_target).max())),
         worst=float(np.abs(apart).max()),
         status=status,
         minimax=best,
@@ -148,25 +161,25 @@ def start_of(model: Model, x: State, status: str, distances: Distances) -> Start
     )
 
 
-Found = Mapping[Job, Mapping[str, Start]]
+WarmStartResults = Mapping[WarmStartJob, Mapping[str, WarmStart]]
 
 
-def study_of(study: Study) -> Found:
+def run_all_cases(study: Study) -> WarmStartResults:
     """All arms of Table 3 that are here."""
-    names = robots_here()[:1] if study.quick else robots_here()
-    jobs = [Job(name, study.seed) for name in names]
-    return dict(zip(jobs, study.sweep(run, jobs, "arms"), strict=True))
+    names = list_available_robots()[:1] if study.quick else list_available_robots()
+    jobs = [WarmStartJob(name, study.seed) for name in names]
+    return dict(zip(jobs, study.sweep(run_arm, jobs, "arms"), strict=True))
 
 
-def table_of(found: Found) -> Table:
+def build_warm_start_table(results: WarmStartResults) -> Table:
     """A row a fit."""
     rows = [
-        (ROBOTS[job.robot][0], name, *(1e6 * f for f in one.sums), 1e6 * sum(one.sums),
+        (CONDITION_ROBOTS[job.robot][0], name, *(1e6 * f for f in one.sums), 1e6 * sum(one.sums),
          1e3 * one.phi, one.worst, one.status, 1e3 * np.sqrt(one.minimax), *one.letter)
-        for job, starts in found.items()
+        for job, starts in results.items()
         for name, one in starts.items()
     ]  # fmt: skip
-    return Table.made(
+    return Table.from_rows(
         "eq. 32 with its constraint and without",
         rows,
         "arm | eq. 32 | F_1 mm² .4f | F_2 mm² .4f | F_3 mm² .4f | sum mm² .4f | RMSE(φ) mm .5f | "
@@ -175,13 +188,13 @@ def table_of(found: Found) -> Table:
     )
 
 
-def save(study: Study, found: Found) -> None:
+def save_results(study: Study, results: WarmStartResults) -> None:
     """The table."""
-    table = table_of(found)
-    study.save([table], {"rows": table.records()})
+    table = build_warm_start_table(results)
+    study.save([table], {"rows": table.to_records()})
 
 
 @study_options("warm_start")
 def main(study: Study) -> None:
     """Paper M's warm start, eq. 32, with c(x) <= 0 and without."""
-    save(study, study_of(study))
+    save_results(study, run_all_cases(study))

@@ -7,39 +7,34 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # the same names for editors and type checkers
-    from minimax_cal.correcting.compensate import Compensation, compensate
-    from minimax_cal.correcting.deliverable import Delivered, deliver
-    from minimax_cal.correcting.export import export
-    from minimax_cal.diagnosing.diagnose import diagnose
-    from minimax_cal.diagnosing.instruments import diagnose_relative
-    from minimax_cal.diagnosing.instruments_result import RelativeDiagnosis
-    from minimax_cal.diagnosing.many import diagnose_many
-    from minimax_cal.diagnosing.result import Diagnosis
-    from minimax_cal.dynamics.budget import evaluate_motion
-    from minimax_cal.dynamics.diagnose import diagnose_motion
-    from minimax_cal.dynamics.laws import register_law
-    from minimax_cal.dynamics.logs import read_runs
-    from minimax_cal.dynamics.logs.table import Run
-    from minimax_cal.dynamics.result import MotionDiagnosis, load_motion
-    from minimax_cal.fitting.calibrate import calibrate, calibrate_many
-    from minimax_cal.fitting.fit import Fit, load_fit
-    from minimax_cal.fitting.options import Options
-    from minimax_cal.fitting.pixels.calibrate import calibrate_pixels
-    from minimax_cal.fitting.several.kinds import relative
-    from minimax_cal.fitting.several.result import RelativeCalibration
-    from minimax_cal.ground.errors import (
+    from minimax_cal.compensation.deliverable import Delivered, deliver
+    from minimax_cal.compensation.joint_compensation import Compensation, compensate
+    from minimax_cal.compensation.robot_export import export
+    from minimax_cal.core.errors import (
         CalibrationError,
         CalibrationWarning,
         DataError,
         OptionError,
         RobotError,
     )
-    from minimax_cal.instruments.table import register_instrument
-    from minimax_cal.judging.bootstrap import bootstrap
-    from minimax_cal.judging.saved import evaluate
-    from minimax_cal.judging.standard import iso9283
-    from minimax_cal.judging.watching.comparison import compare
-    from minimax_cal.judging.watching.health import check
+    from minimax_cal.diagnosing.diagnose import diagnose
+    from minimax_cal.diagnosing.diagnose_instruments import diagnose_relative
+    from minimax_cal.diagnosing.diagnose_many import diagnose_many
+    from minimax_cal.diagnosing.diagnosis import Diagnosis
+    from minimax_cal.diagnosing.instruments_result import RelativeDiagnosis
+    from minimax_cal.dynamics.cross_validation import evaluate_motion
+    from minimax_cal.dynamics.diagnose import diagnose_motion
+    from minimax_cal.dynamics.laws import register_law
+    from minimax_cal.dynamics.logs import read_runs
+    from minimax_cal.dynamics.logs.log_table import Run
+    from minimax_cal.dynamics.result import MotionDiagnosis, load_motion
+    from minimax_cal.fitting.calibrate import calibrate, calibrate_many
+    from minimax_cal.fitting.fit import Fit, load_fit
+    from minimax_cal.fitting.multi_instrument.relative_calibration import relative
+    from minimax_cal.fitting.multi_instrument.relative_result import RelativeCalibration
+    from minimax_cal.fitting.options import Options
+    from minimax_cal.fitting.pixels.calibrate import calibrate_pixels
+    from minimax_cal.instruments.instrument_registry import register_instrument
     from minimax_cal.measuring import datasets
     from minimax_cal.measuring.campaigns import read_campaigns
     from minimax_cal.measuring.importers import import_files
@@ -54,14 +49,19 @@ if TYPE_CHECKING:  # the same names for editors and type checkers
     from minimax_cal.modelling.simulate import Simulation, Truth, simulate
     from minimax_cal.planning.motion_plan import plan_motion
     from minimax_cal.planning.plan import plan
-    from minimax_cal.reporting.plots.figures import plot_errors
-    from minimax_cal.reporting.report import report
+    from minimax_cal.reporting.plots.error_figure import plot_errors
+    from minimax_cal.reporting.report_file import report
     from minimax_cal.robots.robot import Robot, builtin_robots, load_robot
     from minimax_cal.simulators.drive import load_commands
-    from minimax_cal.simulators.ladder import simulator_gap
-    from minimax_cal.simulators.motion.ladder import motion_gap
+    from minimax_cal.simulators.gap import simulator_gap
+    from minimax_cal.simulators.motion.gap import motion_gap
     from minimax_cal.simulators.result import MotionGap, SimulatorGap
     from minimax_cal.solvers.minimize import minimize_max
+    from minimax_cal.validation.bootstrap import bootstrap
+    from minimax_cal.validation.evaluation import evaluate
+    from minimax_cal.validation.iso9283_of_result import iso9283
+    from minimax_cal.validation.monitoring.calibration_check import check
+    from minimax_cal.validation.monitoring.comparison import compare
 
     __version__: str
 
@@ -132,11 +132,11 @@ __all__ = [
 ]
 
 MODULES = {  # name: where it is defined
-    "CalibrationError": "ground.errors",
-    "CalibrationWarning": "ground.errors",
-    "DataError": "ground.errors",
-    "OptionError": "ground.errors",
-    "RobotError": "ground.errors",
+    "CalibrationError": "core.errors",
+    "CalibrationWarning": "core.errors",
+    "DataError": "core.errors",
+    "OptionError": "core.errors",
+    "RobotError": "core.errors",
     "minimize_max": "solvers.minimize",
     "Robot": "robots.robot",
     "builtin_robots": "robots.robot",
@@ -152,7 +152,7 @@ MODULES = {  # name: where it is defined
     "load_cell": "modelling.cell",
     "EFFECTS": "modelling.effects.table",
     "register": "modelling.effects.table",
-    "register_instrument": "instruments.table",
+    "register_instrument": "instruments.instrument_registry",
     "Simulation": "modelling.simulate",
     "Truth": "modelling.simulate",
     "simulate": "modelling.simulate",
@@ -162,39 +162,39 @@ MODULES = {  # name: where it is defined
     "calibrate": "fitting.calibrate",
     "calibrate_many": "fitting.calibrate",
     "calibrate_pixels": "fitting.pixels.calibrate",
-    "relative": "fitting.several.kinds",
-    "bootstrap": "judging.bootstrap",
-    "evaluate": "judging.saved",
-    "check": "judging.watching.health",
-    "compare": "judging.watching.comparison",
-    "iso9283": "judging.standard",
-    "Diagnosis": "diagnosing.result",
+    "relative": "fitting.multi_instrument.relative_calibration",
+    "bootstrap": "validation.bootstrap",
+    "evaluate": "validation.evaluation",
+    "check": "validation.monitoring.calibration_check",
+    "compare": "validation.monitoring.comparison",
+    "iso9283": "validation.iso9283_of_result",
+    "Diagnosis": "diagnosing.diagnosis",
     "diagnose": "diagnosing.diagnose",
-    "diagnose_many": "diagnosing.many",
-    "RelativeCalibration": "fitting.several.result",
+    "diagnose_many": "diagnosing.diagnose_many",
+    "RelativeCalibration": "fitting.multi_instrument.relative_result",
     "RelativeDiagnosis": "diagnosing.instruments_result",
-    "diagnose_relative": "diagnosing.instruments",
-    "Run": "dynamics.logs.table",
+    "diagnose_relative": "diagnosing.diagnose_instruments",
+    "Run": "dynamics.logs.log_table",
     "register_law": "dynamics.laws",
     "read_runs": "dynamics.logs",
     "MotionDiagnosis": "dynamics.result",
     "load_motion": "dynamics.result",
     "diagnose_motion": "dynamics.diagnose",
-    "evaluate_motion": "dynamics.budget",
+    "evaluate_motion": "dynamics.cross_validation",
     "plan": "planning.plan",
     "plan_motion": "planning.motion_plan",
-    "Compensation": "correcting.compensate",
-    "compensate": "correcting.compensate",
-    "Delivered": "correcting.deliverable",
-    "deliver": "correcting.deliverable",
-    "export": "correcting.export",
+    "Compensation": "compensation.joint_compensation",
+    "compensate": "compensation.joint_compensation",
+    "Delivered": "compensation.deliverable",
+    "deliver": "compensation.deliverable",
+    "export": "compensation.robot_export",
     "SimulatorGap": "simulators.result",
     "load_commands": "simulators.drive",
-    "simulator_gap": "simulators.ladder",
+    "simulator_gap": "simulators.gap",
     "MotionGap": "simulators.result",
-    "motion_gap": "simulators.motion.ladder",
-    "plot_errors": "reporting.plots.figures",
-    "report": "reporting.report",
+    "motion_gap": "simulators.motion.gap",
+    "plot_errors": "reporting.plots.error_figure",
+    "report": "reporting.report_file",
 }
 
 

@@ -21,12 +21,14 @@ from click.testing import CliRunner
 
 import minimax_cal as mc
 from minimax_cal.cli import main, progress
-from minimax_cal.cli.options import in_flags
-from minimax_cal.ground.errors import CalibrationError
+from minimax_cal.cli.options import replace_arguments_by_flags
+from minimax_cal.core.errors import CalibrationError
 from minimax_cal.modelling.simulate import Simulation, Truth, simulate
-from minimax_cal.planning import outlook, plan, task
+from minimax_cal.planning import plan, plan_predictions, planning_task
 
-progress.FIRST = 60.0  # tests compare stderr, and a busy machine takes more than a second
+progress.SECONDS_TO_FIRST_PROGRESS_LINE = (
+    60.0  # tests compare stderr, and a busy machine takes more than a second
+)
 
 ROOT = Path(__file__).parent.parent
 SHARED = ROOT.parent / "shared" / "data"
@@ -95,11 +97,11 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def few_candidates() -> Iterator[None]:
     """Plans sooner: what is written, seen and promised is the same; poses need not be best."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(plan, "STEPS", (0.05,))
-        patch.setattr(plan, "KEPT", 60)
-        patch.setattr(task, "WORK", 250)
-        patch.setattr(outlook, "GROWTH", (0.5, 1.0))
-        patch.setattr(outlook, "DRAWS", 20)
+        patch.setattr(plan, "REFINEMENT_STEP_FRACTIONS", (0.05,))
+        patch.setattr(plan, "POSES_KEPT_PER_REFINEMENT", 60)
+        patch.setattr(planning_task, "WORKSPACE_PREDICTION_POSES", 250)
+        patch.setattr(plan_predictions, "COMPARED_POSE_COUNT_RATIOS", (0.5, 1.0))
+        patch.setattr(plan_predictions, "RANDOM_DESIGNS_PER_MEDIAN", 20)
         yield
 
 
@@ -188,7 +190,7 @@ def invoked(command: click.Command, *arguments: object) -> tuple[int, str, str]:
     """Exit code, stdout, stderr of a command as `main` would run it."""
     result = CliRunner().invoke(command, [str(a) for a in arguments], standalone_mode=False)
     if isinstance(result.exception, CalibrationError | click.ClickException):
-        return 2, result.stdout, in_flags(str(result.exception), command)
+        return 2, result.stdout, replace_arguments_by_flags(str(result.exception), command)
     if result.exception:
         raise result.exception
     return int(result.return_value), result.stdout, result.stderr

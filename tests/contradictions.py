@@ -7,12 +7,12 @@ import re
 from collections.abc import Iterator
 
 import minimax_cal as mc
-from minimax_cal.diagnosing.result import Explained
-from minimax_cal.diagnosing.sentences import NOT_VISITED, NOTHING_MM
-from minimax_cal.diagnosing.verdict import ABOVE_NOISE
-from minimax_cal.dynamics.laws import USUAL
-from minimax_cal.dynamics.result import SENTENCES
-from minimax_cal.evidence.limits import CONFIRMED, STRUCTURE
+from minimax_cal.diagnosing.diagnosis import Explanation
+from minimax_cal.diagnosing.diagnosis_sentences import MIN_REPORTED_MM, UNKNOWN_REPEATABILITY_TEXT
+from minimax_cal.diagnosing.verdict import ABOVE_NOISE_TEXT
+from minimax_cal.dynamics.laws import USUAL_FRICTION_EFFECTS
+from minimax_cal.dynamics.result import MOTION_VERDICT_SENTENCES
+from minimax_cal.selection.thresholds import MIN_CONFIRMED_FREQUENCY, REMAINING_STRUCTURE_P_VALUE
 from minimax_cal.solvers.status import Status
 
 NEAR = 1e-9
@@ -24,7 +24,7 @@ def same(one: float, other: float) -> bool:
     return bool(math.isclose(one, other, rel_tol=NEAR)) or (math.isnan(one) and math.isnan(other))
 
 
-def contradictions(found: Explained | mc.MotionDiagnosis) -> list[str]:
+def contradictions(found: Explanation | mc.MotionDiagnosis) -> list[str]:
     """Every pair of statements of a diagnosis that cannot both be true."""
     if isinstance(found, mc.MotionDiagnosis):
         rules = list(of_torques(found))
@@ -37,9 +37,9 @@ def contradictions(found: Explained | mc.MotionDiagnosis) -> list[str]:
     return [name for name, holds in rules if not holds]
 
 
-def of_causes(found: Explained) -> Iterator[tuple[str, bool]]:
+def of_causes(found: Explanation) -> Iterator[tuple[str, bool]]:
     """Causes: named once, by one verdict, as large as they are said to be."""
-    text, main = " ".join(found.reasons), found.main
+    text, main = " ".join(found.reasons), found.main_findings
     sure, loose = ([f for f in found.effects if f.established is such] for such in (True, False))
     keys = [(f.effect, f.place) for f in found.effects]
     yield "an effect stands twice", len(keys) == len(set(keys))
@@ -56,19 +56,22 @@ def of_causes(found: Explained) -> Iterator[tuple[str, bool]]:
         found.verdict != "named" or not any(f.alternatives for f in main),
     )
     often = re.search(r"again in (?:at least )?(\d+) %", text)
-    yield "confirmed, and seldom found", not often or int(often[1]) >= 100 * CONFIRMED - 0.5
+    yield (
+        "confirmed, and seldom found",
+        not often or int(often[1]) >= 100 * MIN_CONFIRMED_FREQUENCY - 0.5,
+    )
     yield "a share above all", all(not f.share > 1.0 for f in found.effects)
     yield "a main cause that is minor", all(not f.minor for f in main) or len(main) == 1
     yield (
         "unknown, and its p is large",
-        ("is not random" not in text or found.structure < STRUCTURE),
+        ("is not random" not in text or found.structure < REMAINING_STRUCTURE_P_VALUE),
     )
 
 
 def of_budget(found: mc.Diagnosis) -> Iterator[tuple[str, bool]]:
     """The budget: one arm, that is recommended, at one set of poses."""
     rows, last = found.budget, found.ladder[-1]
-    sure = {f.term.step for f in found.effects if f.established and not f.rows}
+    sure = {f.term.budget_step_name for f in found.effects if f.established and not f.rows}
     steps = {row["name"] for row in rows[2:] if row["name"].startswith("+ ")}
     text = " ".join(found.reasons)
     yield "a step that is not confirmed", steps <= sure
@@ -98,8 +101,11 @@ def of_rest(found: mc.Diagnosis) -> Iterator[tuple[str, bool]]:
     told = re.search(r"Remaining error ([\d.]+) mm", text)
     yield "two remaining errors", bool(told) and told[1] == f"{error:.3f}"
     yield "dependence, and none", ("no dependence was found" in text) != bool(left.depends)
-    known = found.floor_known or left.unexplained_mm < NOTHING_MM
-    yield "an open floor in the first sentence", (NOT_VISITED in found.reasons[0]) != known
+    known = found.floor_known or left.unexplained_mm < MIN_REPORTED_MM
+    yield (
+        "an open floor in the first sentence",
+        (UNKNOWN_REPEATABILITY_TEXT in found.reasons[0]) != known,
+    )
     yield (
         "unexplained, and perhaps repeatability",
         not ("is unexplained" in text and "may be the arm's repeatability" in text),
@@ -107,13 +113,17 @@ def of_rest(found: mc.Diagnosis) -> Iterator[tuple[str, bool]]:
     unsure = found.verdict == "unknown" or not found.floor_known
     yield "unknown, and nothing to do", following is not None or not unsure
     yield "to do, and not told", following is None or following.text in text
-    if found.structure_in == ABOVE_NOISE and found.verdict == "unknown":
+    if found.structure_in == ABOVE_NOISE_TEXT and found.verdict == "unknown":
         low, high = found.tested
         yield "above noise that is as large", f"{low:.3f}" > f"{high:.3f}"
         yield "two noises", not noise > high
     yield (
         "random, and above noise",
-        not (found.verdict == "none" and found.structure < STRUCTURE and left.depends),
+        not (
+            found.verdict == "none"
+            and found.structure < REMAINING_STRUCTURE_P_VALUE
+            and left.depends
+        ),
     )
 
 
@@ -125,7 +135,7 @@ def of_torques(found: mc.MotionDiagnosis) -> Iterator[tuple[str, bool]]:
     open_ones = {(one.effect, one.place) for one in found.not_testable}
     yield "an effect is found and not testable", not open_ones & set(keys)
     yield "named, and nothing is", found.verdict != "named" or bool(found.main)
-    odd = [one for one in found.main if one.effect not in USUAL]
+    odd = [one for one in found.main if one.effect not in USUAL_FRICTION_EFFECTS]
     yield "none, and a cause", found.verdict != "none" or not odd
     yield "none, and unexplained", found.verdict != "none" or not found.unexplained
     yield "too little motion, and a name", not (found.too_little and odd)
@@ -135,4 +145,7 @@ def of_torques(found: mc.MotionDiagnosis) -> Iterator[tuple[str, bool]]:
     ends = zip(found.budget[0].holdout_rms, last.holdout_rms, strict=True)
     yield "a budget that rises", any(after <= before for before, after in ends)
     yield "a curve of another run", found.held_run.name in found.runs
-    yield "words of another verdict", SENTENCES[found.verdict] in text or bool(found.too_little)
+    yield (
+        "words of another verdict",
+        MOTION_VERDICT_SENTENCES[found.verdict] in text or bool(found.too_little),
+    )

@@ -10,8 +10,8 @@ import numpy as np
 import yaml
 
 import minimax_cal as mc
-from minimax_cal.fitting.accuracy import accuracy
-from minimax_cal.fitting.opened import place
+from minimax_cal.fitting.accuracy import summarise_point_errors
+from minimax_cal.fitting.opened_results import place_nominal_arm
 from minimax_cal.measuring.measurements import Measurements
 
 KEYS = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -79,4 +79,4 @@ def reached(fit: mc.Fit, to: str, new: Measurements, folder: Path) -> float:
     """RMS on new poses of the file of a fit, loaded again, base and targets fitted to them [mm]."""
     text = mc.export(fit, to, notify=lambda notice: None)
     robot = READERS[to](text, fit.nominal.robot, folder)
-    return accuracy(place(robot, new).error(new)).rms_mm
+    return summarise_point_errors(place_nominal_arm(robot, new).error(new)).rms_mm

@@ -9,10 +9,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
-from minimax_cal.robots.gravity import tubes
-from minimax_cal.robots.mjcf import numbers
-from minimax_cal.robots.transforms import inverse, transform
-from minimax_cal.simulators.elements import frames
+from minimax_cal.robots.gravity_torques import assumed_link_masses_and_centres
+from minimax_cal.robots.mjcf_import import format_exact_numbers
+from minimax_cal.robots.transforms import build_transform, invert_transform
+from minimax_cal.simulators.elements import joint_frames_at_zero
 
 GAINS = (2000.0, 2000.0, 2000.0, 500.0, 500.0, 500.0)  # of the size that published arms have
 TETRAHEDRON = """v 0 0 0
@@ -78,17 +78,20 @@ def ur10_like(
     damping: of each servo, as a share of its gain.
     """
     robot = mc.load_robot("ur10")
-    at, lines, n = frames(robot), list[str](), robot.joints
-    _, com = tubes(robot.mdh)
+    at, lines, n = joint_frames_at_zero(robot), list[str](), robot.joints
+    _, com = assumed_link_masses_and_centres(robot.mdh)
     for i, frame in enumerate(at):
-        place = (inverse(at[i - 1]) if i else np.eye(4)) @ frame
+        place = (invert_transform(at[i - 1]) if i else np.eye(4)) @ frame
         quat = Rotation.from_matrix(place[:3, :3]).as_quat(scalar_first=True)
-        end = inverse(frame) @ (at[i + 1] if i + 1 < n else frame)
+        end = invert_transform(frame) @ (at[i + 1] if i + 1 < n else frame)
         centre = end[:3, :3] @ com[i] + end[:3, 3] if i + 1 < n else np.array([0.0, 0.0, 0.05])
         tab = "  " * (i + 2)
         lines += [
-            f"{tab}<body name='part{i + 1}' pos='{numbers(place[:3, 3])}' quat='{numbers(quat)}'>",
-            f"{tab}  <inertial mass='{MASSES[i]}' pos='{numbers(centre)}'",
+            (
+                f"{tab}<body name='part{i + 1}' pos='{format_exact_numbers(place[:3, 3])}"
+                f"' quat='{format_exact_numbers(quat)}'>"
+            ),
+            f"{tab}  <inertial mass='{MASSES[i]}' pos='{format_exact_numbers(centre)}'",
             f"{tab}            diaginertia='0.05 0.05 0.02'/>",
             f'{tab}  <joint name="joint{i + 1}" class="size{i + 1}"/> <!-- joint {i + 1} -->',
         ]
@@ -178,23 +181,25 @@ def springs(name: str) -> bool:
 
 def bodies(robot: mc.Robot) -> str:
     """The arm's bodies, each in a frame of its own."""
-    rng, at = np.random.default_rng(4), frames(robot)
-    mass, com = tubes(robot.mdh)
+    rng, at = np.random.default_rng(4), joint_frames_at_zero(robot)
+    mass, com = assumed_link_masses_and_centres(robot.mdh)
     out, before, closing = "", np.eye(4), ""
     for i, frame in enumerate(at):
-        turned = transform(Rotation.random(rng=rng).as_matrix(), 0.03 * rng.normal(size=3))
+        turned = build_transform(Rotation.random(rng=rng).as_matrix(), 0.03 * rng.normal(size=3))
         body = frame @ turned
-        place = inverse(before) @ body
+        place = invert_transform(before) @ body
         axis = turned[:3, :3].T @ [0.0, 0.0, robot.sign[i]]
-        anchor = inverse(turned)[:3, 3]
+        anchor = invert_transform(turned)[:3, 3]
         euler = Rotation.from_matrix(place[:3, :3]).as_euler("XYZ", degrees=True)
-        end = at[i] @ inverse(at[i]) @ frame
-        centre = inverse(turned) @ np.append(0.3 * com[i], 1.0)
+        end = at[i] @ invert_transform(at[i]) @ frame
+        centre = invert_transform(turned) @ np.append(0.3 * com[i], 1.0)
         out += (
-            f"<body name='part{i}' childclass='arm' pos='{numbers(place[:3, 3])}' "
-            f"euler='{numbers(euler)}'><inertial pos='{numbers(centre[:3])}' "
+            f"<body name='part{i}' childclass='arm' pos='{format_exact_numbers(place[:3, 3])}' "
+            f"euler='{format_exact_numbers(euler)}'><inertial "
+            f"pos='{format_exact_numbers(centre[:3])}' "
             f"mass='{max(0.3 * mass[i], 0.5)}' diaginertia='0.1 0.1 0.1'/>"
-            f"<joint name='axis{i}' pos='{numbers(anchor)}' axis='{numbers(axis)}'/>"
+            f"<joint name='axis{i}' pos='{format_exact_numbers(anchor)}"
+            f"' axis='{format_exact_numbers(axis)}'/>"
             "<geom type='mesh' mesh='part'/>"
         )
         if i == 2:

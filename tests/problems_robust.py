@@ -5,15 +5,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 import minimax_cal as mc
-from experiments.speed import identified
-from minimax_cal.fitting.robust import Fitter, Robust, robust_fit
-from minimax_cal.ground.arrays import Array
+from experiments.speed import identify_parameters
+from minimax_cal.core.arrays import Array
+from minimax_cal.fitting.robust_fit import Fitter, RobustFit, fit_robust_loss
 from minimax_cal.modelling.cell import Cell
-from minimax_cal.modelling.model import Model, SumOfSquares
-from minimax_cal.modelling.parameters import State
+from minimax_cal.modelling.parameters import ParameterValues
+from minimax_cal.modelling.point_model import PointLeastSquares, PointModel
 from minimax_cal.modelling.simulate import Simulation, Truth, simulate
 from minimax_cal.solvers import least_squares
-from minimax_cal.solvers.least_squares import METHODS, LeastSquares
+from minimax_cal.solvers.least_squares import LEAST_SQUARES_METHODS, LeastSquaresSolution
 
 NOISE = 20e-6  # of a coordinate, the same for all points [m]
 EVEN = Truth(compliance=0.0, noise=NOISE, noise_per_metre=0.0)
@@ -27,28 +27,28 @@ class Case:
     robot: mc.Robot
     made: Simulation
     data: mc.Measurements
-    model: Model
-    found: LeastSquares[State]
+    model: PointModel
+    found: LeastSquaresSolution[ParameterValues]
     bad: Array
 
-    def robust(self, loss: str = "square", trim: float = 0.0) -> Robust:
+    def robust(self, loss: str = "square", trim: float = 0.0) -> RobustFit:
         """The robust fit."""
         given, judged = (fit, self.model, self.found, self.data.line), np.ones(len(self.model.y))
-        return robust_fit(*given, loss, trim, judged=judged > 0.0)
+        return fit_robust_loss(*given, loss, trim, is_judged=judged > 0.0)
 
-    def without(self) -> State:
+    def without(self) -> ParameterValues:
         """Least squares on the right points alone."""
         model = replace(self.model, weight=self.model.weight * ~self.bad)
         return state_of(fit(model, state_of(self.found))[1])
 
-    def miss(self, state: State) -> float:
+    def miss(self, state: ParameterValues) -> float:
         """RMS distance from the true robot's points, at new poses [m]."""
         q = np.random.default_rng(1).uniform(-2.0, 2.0, (100, self.robot.joints))
-        cell = Cell.of(self.robot, state, self.data.target_names)
+        cell = Cell.from_parameters(self.robot, state, self.data.target_names)
         error = cell.predict(q) - self.made.cell.predict(q)
         return float(np.sqrt((error**2).sum(axis=-1).mean()))
 
-    def listed(self, found: Robust) -> Array:
+    def listed(self, found: RobustFit) -> Array:
         """(k, m) True for the suspects."""
         out = np.zeros_like(self.bad)
         for one in found.suspects:
@@ -56,17 +56,24 @@ class Case:
         return out
 
 
-def state_of(found: LeastSquares[State]) -> State:
+def state_of(found: LeastSquaresSolution[ParameterValues]) -> ParameterValues:
     """The one solution of a batch of one."""
     return found.x.take(np.array(0))
 
 
-def fit(model: Model, begin: State) -> tuple[Model, LeastSquares[State]]:
+def fit(
+    model: PointModel, begin: ParameterValues
+) -> tuple[PointModel, LeastSquaresSolution[ParameterValues]]:
     """Plain least squares of a model."""
-    points = float(model.counts.sum())
-    problem = SumOfSquares(model)
+    points = float(model.pose_counts_by_target.sum())
+    problem = PointLeastSquares(model)
     return model, least_squares.solve(
-        problem, begin.batch(), 1, points, METHODS["snllm"], least_squares.NEAR
+        problem,
+        begin.batch(),
+        1,
+        points,
+        LEAST_SQUARES_METHODS["snllm"],
+        least_squares.NEAR_START_LIMITS,
     )
 
 
@@ -75,7 +82,7 @@ FITTER: Fitter = fit
 
 def case_of(robot: mc.Robot, made: Simulation, data: mc.Measurements, bad: Array) -> Case:
     """The identifiable parameters and the plain fit of some measurements.  bad: (m, k)."""
-    model, found = fit(*identified(robot, data))
+    model, found = fit(*identify_parameters(robot, data))
     return Case(robot, made, data, model, found, bad.T)
 
 

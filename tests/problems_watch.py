@@ -6,11 +6,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
-from minimax_cal.ground.arrays import Array
+from minimax_cal.core.arrays import Array
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.simulate import Truth, simulate
 from minimax_cal.robots import kinematics
-from minimax_cal.robots.sampling import random_poses
+from minimax_cal.robots.joint_sampling import random_joint_values_above_floor
 
 SHIFT = 2e-4  # of a joint's zero [rad]
 
@@ -50,7 +50,7 @@ def checked(arm: str, seed: int) -> Checked:
     fit = mc.calibrate(arm, made.data, "sum")
     rng = np.random.default_rng([seed, 1])
     joint = 1 + seed % (made.cell.robot.joints - 2)
-    q = random_poses(made.cell.robot, 10, rng, truth.span)
+    q = random_joint_values_above_floor(made.cell.robot, 10, rng, truth.span)
     as_it_was, knocked = (
         mc.check(fit, seen_anew(shifted(made.cell, joint, by), q, truth, rng), "rms 0.2")
         for by in (0.0, SHIFT)

@@ -14,10 +14,10 @@ import pytest
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.cli.commands import ENTRIES, said_of
-from minimax_cal.cli.running import cli
-from minimax_cal.fitting.several.options import RelativeOptions
-from minimax_cal.planning.options import PlanOptions
+from minimax_cal.cli.command_group import COMMAND_MODULES, read_first_help_sentence
+from minimax_cal.cli.command_runner import cli
+from minimax_cal.fitting.multi_instrument.options import RelativeOptions
+from minimax_cal.planning.plan_options import PlanOptions
 
 FUNCTIONS = [name for name in mc.__all__ if inspect.isfunction(getattr(mc, name))]
 
@@ -59,9 +59,19 @@ def test_type_checkers_see_the_same_names():
 def test_a_calibration_imports_no_statistics_and_no_pictures():
     """And what is put off is there when it is asked for."""
     heavy = ("scipy.stats", "pandas", "matplotlib", "cvxpy", "plotly", "jinja2", "numba")
-    unused = (*heavy, "numpy.f2py.crackfortran", "unittest", "yaml", "minimax_cal.robots.urdf",
-              "minimax_cal.evidence.selection", "minimax_cal.judging.bootstrap")  # fmt: skip
-    code = "from minimax_cal.cli.commands import quickly\nquickly('minimax_cal.cli.calibrate')"
+    unused = (
+        *heavy,
+        "numpy.f2py.crackfortran",
+        "unittest",
+        "yaml",
+        "minimax_cal.robots.urdf_robot",
+        "minimax_cal.selection.forward_selection",
+        "minimax_cal.validation.bootstrap",
+    )
+    code = (
+        "from minimax_cal.cli.command_group import import_quickly\n"
+        "import_quickly('minimax_cal.cli.calibrate')"
+    )
     late = f"\nimport sys\nfound = [name for name in {unused} if name in sys.modules]"
     late += "\nfrom numpy import testing\ntesting.assert_allclose(1.0, 1.0)\nassert found == []"
     assert after(code + late, "minimax_cal.fitting.calibrate")["minimax_cal.fitting.calibrate"]
@@ -83,7 +93,7 @@ def test_no_module_shadows_a_public_name():
     assert modules == {"datasets"}
     assert {"calibrate", "diagnose", "export", "iso9283", "plan", "report"} <= set(FUNCTIONS)
     code = (
-        "import minimax_cal.judging.iso9283, minimax_cal.reporting.report"
+        "import minimax_cal.validation.iso9283, minimax_cal.reporting.report_file"
         "\nimport minimax_cal.cli.plan, minimax_cal as mc, inspect"
         "\nassert all(map(inspect.isfunction, (mc.iso9283, mc.plan, mc.report, mc.simulate)))"
     )
@@ -193,18 +203,21 @@ def test_version_and_help_import_no_command():
 def test_no_command_waits_for_what_its_help_does_not_need():
     heavy = ("scipy.stats", "scipy.optimize", "scipy.interpolate", "scipy.signal", "scipy.ndimage")
     heavy += ("cvxpy", "qpsolvers", "numba", "matplotlib", "plotly", "jinja2", "mujoco", "pandas")
-    code = "import minimax_cal.cli.running as r\nfor name in r.ENTRIES:\n    r.cli.commands[name]"
+    code = (
+        "import minimax_cal.cli.command_runner as r\nfor name "
+        "in r.COMMAND_MODULES:\n    r.cli.commands[name]"
+    )
     imported = after(code, *heavy, "minimax_cal.cli.diagnose")
     assert [name for name, here in imported.items() if here] == ["minimax_cal.cli.diagnose"]
 
 
 def test_the_list_says_what_the_commands_say():
     context = click.Context(cli)
-    assert cli.list_commands(context) == list(cli.commands) == list(ENTRIES)
-    for name in ENTRIES:
+    assert cli.list_commands(context) == list(cli.commands) == list(COMMAND_MODULES)
+    for name in COMMAND_MODULES:
         command = cli.get_command(context, name)
         assert command is not None
         assert command.name == name
         first = " ".join((command.help or "").partition("\n\n")[0].split())
-        assert first == said_of(name) != ""
+        assert first == read_first_help_sentence(name) != ""
     assert cli.get_command(context, "callibrate") is None

@@ -13,9 +13,9 @@ import pytest
 from conftest import ROOT, slipped
 
 import minimax_cal as mc
-from minimax_cal.cli.schemas import KINDS, schema_of
-from minimax_cal.ground.errors import CalibrationError
-from minimax_cal.ground.results import Result
+from minimax_cal.cli.schemas import SCHEMA_CLASS_BY_KIND, build_file_schema
+from minimax_cal.core.errors import CalibrationError
+from minimax_cal.core.results import Result
 
 INPUTS = ROOT / "tests" / "frozen_inputs"
 PLAIN, CELL, DRIVEN = INPUTS / "plain.csv", INPUTS / "cell", INPUTS / "driven"
@@ -36,14 +36,15 @@ def driven_gap() -> Any:
 
 def by_torques() -> Any:
     pytest.importorskip("mujoco", reason="mujoco is not installed")
-    from minimax_cal.cli.torques import model_of
-    from minimax_cal.dynamics.given import read_logs
+    from minimax_cal.cli.torques import load_torque_robot
+    from minimax_cal.dynamics.known_inputs import read_runs_of_robot
 
-    runs = read_logs(str(DRIVEN / "arm.xml"), RUNS)
-    return mc.diagnose_motion(model_of(str(DRIVEN / "arm.xml"), runs), runs)
+    runs = read_runs_of_robot(str(DRIVEN / "arm.xml"), RUNS)
+    return mc.diagnose_motion(load_torque_robot(str(DRIVEN / "arm.xml"), runs), runs)
 
 
-MAKERS: dict[str, Callable[[], Any]] = {  # by the names of `cli.schemas.KINDS`, and variants
+# by the names of `cli.schemas.SCHEMA_CLASS_BY_KIND`, and variants
+MAKERS: dict[str, Callable[[], Any]] = {
     "calibration": partial(mc.calibrate, "irb2600", PLAIN),
     "calibration, point": partial(mc.calibrate, "irb2600", PLAIN, "point", cv=True),
     "calibration, effects": partial(
@@ -89,7 +90,7 @@ def differing(one: Any, other: Any, rel: float, at: str = "") -> Iterator[str]:
 
 
 def test_every_kind_is_made():
-    assert {name.partition(",")[0] for name in MAKERS} == KINDS.keys() - {"robot"}
+    assert {name.partition(",")[0] for name in MAKERS} == SCHEMA_CLASS_BY_KIND.keys() - {"robot"}
 
 
 @pytest.mark.parametrize("name", MAKERS)
@@ -109,7 +110,7 @@ def test_a_file_comes_back(name):
 @pytest.mark.parametrize("name", MAKERS)
 def test_a_file_is_as_its_schema_says(name):
     jsonschema = pytest.importorskip("jsonschema", reason="jsonschema is not installed")
-    made = jsonschema.Draft202012Validator(schema_of(name.partition(",")[0]))
+    made = jsonschema.Draft202012Validator(build_file_schema(name.partition(",")[0]))
     assert not [fault.message for fault in made.iter_errors(json.loads(result_of(name).json()))]
 
 

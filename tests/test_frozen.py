@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from minimax_cal.cli.commands import ENTRIES
-from minimax_cal.correcting.exporters.table import EXPORTERS
+from minimax_cal.cli.command_group import COMMAND_MODULES
+from minimax_cal.compensation.exporters.export_formats import EXPORTERS
 from tests import frozen
 
 TEXT = "progress: reading, 3 s\nRMS 0.25 mm after 1.5 s\n"
@@ -92,7 +92,7 @@ def test_every_command_format_and_input_is_in_it():
         "backends",
         "tradeoff",
     }  # a server; what is installed; a picture of two ends
-    assert {command[0] for command in asked.values()} == set(ENTRIES) - without
+    assert {command[0] for command in asked.values()} == set(COMMAND_MODULES) - without
     assert set(frozen.FORMATS) == set(EXPORTERS)
     words = [word for command in asked.values() for word in command]
     kept = {p for p in frozen.INPUTS.rglob("*.*") if p.parts[-2] != "assets"}

@@ -15,23 +15,23 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import minimax_cal as mc
-from minimax_cal.diagnosing.curves import Leftover
-from minimax_cal.diagnosing.gap import Judges
-from minimax_cal.fitting.accuracy import accuracy
-from minimax_cal.fitting.floor import deviations
-from minimax_cal.fitting.improvement import hidden
-from minimax_cal.fitting.opened import in_new_frame, open_result
-from minimax_cal.fitting.pose_rows import errors_of, pose_rows
-from minimax_cal.fitting.suspects import Suspect, aside, nearest
-from minimax_cal.ground.arrays import Array
+from minimax_cal.core.arrays import Array
+from minimax_cal.diagnosing.budget_steps import JudgingPoses
+from minimax_cal.diagnosing.residual_curves import ResidualViews
+from minimax_cal.fitting.accuracy import summarise_point_errors
+from minimax_cal.fitting.arm_comparison import mask_points
+from minimax_cal.fitting.noise_floor import squared_deviations_from_pose_mean
+from minimax_cal.fitting.opened_results import open_result, place_in_new_frame
+from minimax_cal.fitting.outliers import Outlier, mask_outliers, nearest_revisits
+from minimax_cal.fitting.pose_records import build_pose_records, compute_or_restore_errors
 from minimax_cal.instruments.instrument import Instrument
-from minimax_cal.instruments.options import InstrumentOptions
-from minimax_cal.instruments.protocol import Arm
-from minimax_cal.instruments.tracker import Points
-from minimax_cal.measuring.checks import outliers
-from minimax_cal.measuring.faults import find_faults
-from minimax_cal.measuring.faults.points import off_fit
-from minimax_cal.modelling.model import model_of
+from minimax_cal.instruments.instrument_options import InstrumentOptions
+from minimax_cal.instruments.protocol import FlangeKinematics
+from minimax_cal.instruments.tracker_points import TrackerPoints
+from minimax_cal.measuring.faults import find_data_faults
+from minimax_cal.measuring.faults.point_faults import find_points_missed_by_fit
+from minimax_cal.measuring.measurement_checks import list_outlier_notices
+from minimax_cal.modelling.point_model import build_point_model
 from minimax_cal.modelling.simulate import Simulation, Truth, simulate
 
 ROBOT = mc.load_robot("irb2600")
@@ -48,8 +48,13 @@ def spoilt(poses: int, targets: int) -> tuple[Simulation, Array]:
 
 def by_tracker(made: Simulation, errors: Callable[..., Array]) -> Array:
     """Errors of an instrument where the cell has base and targets, in axes of the instrument."""
-    cell, flange = made.cell, Arm.of(ROBOT, made.data.q).at(ROBOT.mdh)
-    tracker = replace(Points(made.data).ready(ROBOT, InstrumentOptions()), drawn=cell.state)
+    cell, flange = (
+        made.cell,
+        FlangeKinematics.from_robot(ROBOT, made.data.q).compute_flange_poses(ROBOT.mdh),
+    )
+    tracker = replace(
+        TrackerPoints(made.data).ready(ROBOT, InstrumentOptions()), drawn=cell.parameter_values
+    )
     (own,) = tracker.starts(flange, np.zeros(0))
     found = errors(tracker, flange, own, np.zeros(made.data.poses, dtype=bool))
     return np.asarray(found @ cell.base[:3, :3].T)
@@ -57,8 +62,8 @@ def by_tracker(made: Simulation, errors: Callable[..., Array]) -> Array:
 
 def model_error(made: Simulation) -> Array:
     """Of the model, turned from base axes into those of the instrument."""
-    state = made.cell.state
-    return np.asarray(model_of(ROBOT, made.data).error(state) @ state.rotation.T)
+    state = made.cell.parameter_values
+    return np.asarray(build_point_model(ROBOT, made.data).point_errors(state) @ state.rotation.T)
 
 
 ERRORS: Mapping[str, Callable[[Simulation], Array]] = {
@@ -66,15 +71,15 @@ ERRORS: Mapping[str, Callable[[Simulation], Array]] = {
     "Cell.predict": lambda made: made.data.y - made.cell.predict(made.data.q),
     "Cell.follow": lambda made: made.data.y - made.cell.follow(made.data),
     "Model.error": model_error,
-    "Points.errors": lambda made: by_tracker(made, Points.errors),
-    "pose_rows.errors_of": lambda made: errors_of(
+    "Points.errors": lambda made: by_tracker(made, TrackerPoints.part_errors),
+    "pose_rows.errors_of": lambda made: compute_or_restore_errors(
         made.cell, made.data, made.data.y - made.cell.predict(made.data.q)
     ),
-    "Judges.errors": lambda made: Judges(
+    "Judges.errors": lambda made: JudgingPoses(
         made.data, made.data, np.zeros(made.data.seen.shape, dtype=bool)
-    ).errors(made.cell),
+    ).heldout_errors(made.cell),
     "Leftover.errors": lambda made: (
-        Leftover.of(
+        ResidualViews.from_cells(
             made.data, np.zeros(made.data.poses, dtype=bool), 1e-5, (made.cell, made.cell), ()
         ).errors[0]
         @ made.cell.base[:3, :3].T
@@ -82,7 +87,7 @@ ERRORS: Mapping[str, Callable[[Simulation], Array]] = {
     "written and read": lambda made: (
         1e-3
         * np.array(
-            pose_rows(
+            build_pose_records(
                 made.data,
                 np.zeros(made.data.poses, dtype=bool),
                 {"final": made.cell.error(made.data)},
@@ -104,14 +109,14 @@ def test_errors_are_of_poses_and_targets(name: str, poses: int, targets: int) ->
 @pytest.mark.parametrize(("poses", "targets"), SIZES)
 def test_derivatives_and_rows_of_any_instrument_are_too(poses: int, targets: int) -> None:
     made, _ = spoilt(poses, targets)
-    model, state = model_of(ROBOT, made.data), made.cell.state
-    jacobian = model.jacobian(state)
-    assert jacobian.shape == (poses, targets, 3, model.names.count)
+    model, state = build_point_model(ROBOT, made.data), made.cell.parameter_values
+    jacobian = model.point_jacobian(state)
+    assert jacobian.shape == (poses, targets, 3, model.names.parameter_count)
     for column in (1, 14, 30):  # by central differences
-        step = 1e-6 * np.eye(model.names.count)[column]
-        up, down = (model.error(state.step(sign * step)) for sign in (1.0, -1.0))
+        step = 1e-6 * np.eye(model.names.parameter_count)[column]
+        up, down = (model.point_errors(state.step(sign * step)) for sign in (1.0, -1.0))
         assert_allclose((down - up) / 2e-6, jacobian[..., column], rtol=0, atol=1e-8)
-    assert by_tracker(made, Instrument.errors).shape == (poses, targets, 3)
+    assert by_tracker(made, Instrument.part_errors).shape == (poses, targets, 3)
     assert made.data.seen.shape == (poses, targets)
 
 
@@ -121,19 +126,19 @@ def test_who_takes_errors_tells_poses_from_targets(poses: int, targets: int) -> 
     data, pose, target = made.data, poses - 1, targets - 1
     by[pose, target] *= 1e3
     size = np.linalg.norm(by, axis=-1)
-    found = accuracy(by)
+    found = summarise_point_errors(by)
     assert (found.poses, found.counts) == (poses, (poses,) * targets)
     assert found.worst == (pose, target)
-    assert_allclose(found.by_target(), 1e3 * np.sqrt((size**2).mean(axis=0)), rtol=1e-12)
-    one = Suspect(int(data.line[pose]), data.target_names[target], 1.0, 9.0, 0.0, False)
-    gone = np.isnan(aside(by, data, [one])).all(axis=-1)
+    assert_allclose(found.rms_by_target(), 1e3 * np.sqrt((size**2).mean(axis=0)), rtol=1e-12)
+    one = Outlier(int(data.line[pose]), data.target_names[target], 1.0, 9.0, 0.0, False)
+    gone = np.isnan(mask_outliers(by, data, [one])).all(axis=-1)
     assert np.argwhere(gone).tolist() == [[pose, target]]
-    assert all(np.array_equal(np.isnan(e).all(axis=-1), gone) for e in hidden(by, by, gone))
+    assert all(np.array_equal(np.isnan(e).all(axis=-1), gone) for e in mask_points(by, by, gone))
     same = np.zeros(poses, dtype=int)
-    assert nearest(by, same)[0].shape == (poses, targets)
-    assert len(deviations(by, same)[0]) == poses * targets
+    assert nearest_revisits(by, same)[0].shape == (poses, targets)
+    assert len(squared_deviations_from_pose_mean(by, same)[0]) == poses * targets
     if poses * targets > 20:  # enough that one of them can stand out
-        (said,) = outliers(data, size)
+        (said,) = list_outlier_notices(data, size)
         assert f"{data.called(int(data.line[pose]))} {data.target_names[target]} " in said
 
 
@@ -142,8 +147,8 @@ def test_a_point_that_a_fit_misses_is_named_by_row_and_target(targets: int) -> N
     made, by = spoilt(20, targets)
     data, error = made.data, by.copy()
     error[17, targets - 1] += 1.0
-    assert off_fit(error) == [(17, targets - 1)]
-    (fault,) = [one for one in find_faults(data, error) if one.effect == "outliers"]
+    assert find_points_missed_by_fit(error) == [(17, targets - 1)]
+    (fault,) = [one for one in find_data_faults(data, error) if one.effect == "outliers"]
     assert set(fault.rows.tolist()) == {17}
     assert targets - 1 in fault.targets
 
@@ -173,5 +178,5 @@ def test_errors_of_a_fit_and_its_file_are_measured_minus_predicted(
     judged = mc.evaluate(fit, data)
     size = np.linalg.norm(fit.error, axis=-1)
     assert judged.worst == np.unravel_index(int(size.argmax()), size.shape)
-    turned = in_new_frame(fit.cell, data)
+    turned = place_in_new_frame(fit.cell, data)
     assert turned.error(data).shape == (20, targets, 3)

@@ -20,7 +20,7 @@ from test_docs import DOCS, PAGES
 
 import minimax_cal as mc
 import qp_backends
-from minimax_cal.cli.running import cli
+from minimax_cal.cli.command_runner import cli
 
 pytestmark = pytest.mark.site
 NEEDED = (

@@ -9,7 +9,7 @@ from typing import get_args
 import pytest
 
 from minimax_cal.fitting.options import Loss, Objective, Options
-from minimax_cal.fitting.robust import LOSSES, SQUARE
+from minimax_cal.fitting.robust_fit import LOSSES, SQUARE_LOSS
 from qp_backends.registry import BACKENDS, CHOOSING, BackendName
 
 ROOT = Path(__file__).parent.parent
@@ -19,13 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 import minimax_cal as mc
 from minimax_cal.instruments import Instrument
-from minimax_cal.instruments.tracker import Points
+from minimax_cal.instruments.tracker_points import TrackerPoints
 from qp_backends import Problem, Solution
 
 robot = mc.load_robot("irb120")
 Rows = NDArray[np.float64]
 
-def of_points(data: mc.Measurements, tracker: Points, q: Rows, y: Rows) -> None:
+def of_points(data: mc.Measurements, tracker: TrackerPoints, q: Rows, y: Rows) -> None:
     assert_type(mc.calibrate(robot, data), mc.Fit)
     assert_type(mc.calibrate("irb120", data, "sum", "clarabel", holdout=0.3), mc.Fit)
     assert_type(mc.calibrate(robot, (q, y)), mc.Fit)
@@ -88,7 +88,7 @@ def test_a_script_has_the_types_that_the_verbs_return(tmp_path):
 
 
 def test_the_literals_are_the_names_that_are_understood():
-    assert set(get_args(Loss)) == {SQUARE, *LOSSES}
+    assert set(get_args(Loss)) == {SQUARE_LOSS, *LOSSES}
     names = {name.partition(":")[0] for name in get_args(BackendName)}
     assert names == set(BACKENDS)
     chosen = {name.partition(":")[0] for name in get_args(BackendName) if ":" in name}

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from conftest import ROOT
 
-from minimax_cal.cli.commands import ENTRIES
+from minimax_cal.cli.command_group import COMMAND_MODULES
 from tests.fuzz.material import material
 
 pytestmark = pytest.mark.slow
@@ -124,6 +124,6 @@ def test_every_command_runs_or_names_its_extra(installed):
         assert "\n" not in line, ended.stderr
         assert "pip install" in line
         assert extra in line
-    assert known - {"--version"} == set(ENTRIES)
+    assert known - {"--version"} == set(COMMAND_MODULES)
     missing = run("calibrate", "irb120", "poses.csv", "--qp", "piqp").stderr
     assert "pip install piqp; daqp is used" in missing

@@ -2,9 +2,9 @@
 
     python tests/thresholds.py
 
-Lists each number of `diagnosing` and `evidence` that is in a comparison, by its name or as it is,
-and each of `evidence/limits.py`.  Whole numbers say how much is sought, or count things; what is
-not above ROUNDING, outside the limits, ends iterations or tells rounding from values; 0 and 1
+Lists each number of `diagnosing` and `selection` that is in a comparison, by its name or as it is,
+and each of `selection/thresholds.py`.  Whole numbers say how much is sought, or count things; what
+is not above ROUNDING, outside the limits, ends iterations or tells rounding from values; 0 and 1
 nobody chose.  The others are compared with a statistic.
 """
 
@@ -14,8 +14,8 @@ import ast
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
-ROOMS = ("diagnosing", "evidence")
-LIMITS = "minimax_cal.evidence.limits"
+ROOMS = ("diagnosing", "selection")
+LIMITS = "minimax_cal.selection.thresholds"
 ROUNDING = 1e-3
 
 Numbers = dict[str, float]  # by module and name, or by place and value

@@ -6,23 +6,23 @@ from pathlib import Path
 from typing import Any
 
 from minimax_cal.cli.options import (
-    DATA,
-    FIT,
-    Output,
-    command,
-    options_of,
-    result_options,
+    DATA_ARGUMENT,
+    FIT_ARGUMENT,
+    CommandOutput,
+    build_result_options,
+    define_command,
+    options_from_parameters,
 )
-from minimax_cal.cli.stderr import complain
-from minimax_cal.ground.files import json_text
-from minimax_cal.ground.options import Option
-from minimax_cal.judging.watching.health import check
+from minimax_cal.cli.stderr_events import report_error
+from minimax_cal.core.files import format_json
+from minimax_cal.core.option_fields import Option
+from minimax_cal.validation.monitoring.calibration_check import check
 
 
-@command
-@FIT
-@DATA
-@options_of(
+@define_command
+@FIT_ARGUMENT
+@DATA_ARGUMENT
+@options_from_parameters(
     check,
     "What is asked",
     tolerance=Option('What is required in mm, as "rms 0.2, max 0.5".'),
@@ -38,13 +38,15 @@ from minimax_cal.judging.watching.health import check
         "so itself.",
     ),
 )
-@result_options("the calibration with what moved refitted (JSON)", keep="checked.json")
-def check_command(fit: Path, data: Path, to: Output, **chosen: Any) -> int:
+@build_result_options(
+    "the calibration with what moved refitted (JSON)", suggested_file_name="checked.json"
+)
+def check_command(fit: Path, data: Path, to: CommandOutput, **chosen: Any) -> int:
     """Check with a few poses in DATA whether FIT is still valid.
 
     FIT is a calibration; what moved since then is said, too.  Instrument and reflectors may have
     moved.  The exit code is 0 if it is valid, else 1.
     """
     found = check(fit, data, **chosen)
-    to.finish(found, file=lambda: json_text(found.fit_dict()))
-    return 0 if found.valid else complain(found.headline())
+    to.write_and_print_result(found, file=lambda: format_json(found.fit_dict()))
+    return 0 if found.valid else report_error(found.headline())

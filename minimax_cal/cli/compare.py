@@ -6,19 +6,19 @@ from pathlib import Path
 
 import click
 
-from minimax_cal.cli.options import PATH, Output, command, result_options
-from minimax_cal.judging.watching.comparison import compare
+from minimax_cal.cli.options import PATH_TYPE, CommandOutput, build_result_options, define_command
+from minimax_cal.validation.monitoring.comparison import compare
 
 
-@command
-@click.argument("a", type=PATH)
-@click.argument("b", type=PATH)
-@result_options("the comparison (JSON)", keep="compared.json")
-def compare_command(a: Path, b: Path, to: Output) -> int:
+@define_command
+@click.argument("a", type=PATH_TYPE)
+@click.argument("b", type=PATH_TYPE)
+@build_result_options("the comparison (JSON)", suggested_file_name="compared.json")
+def compare_command(a: Path, b: Path, to: CommandOutput) -> int:
     """What differs between two calibrations, A and B.
 
     They are from before and after a repair, say.  Both are what `calibrate` or `check` wrote with
     -o, the earlier first.  Base and reflectors may have moved; parameters that look the same as
     such a move are shown as nominal.
     """
-    return to.finish(compare(a, b))
+    return to.write_and_print_result(compare(a, b))

@@ -9,51 +9,61 @@ from typing import Any
 import click
 
 from minimax_cal.cli.options import (
-    FIT,
-    PATH,
-    RUNG,
-    SAFE_CELLS,
-    WIDTH,
-    Output,
-    command,
-    options_from,
-    options_of,
-    result_options,
+    FIT_ARGUMENT,
+    PATH_TYPE,
+    PIPED_OUTPUT_WIDTH,
+    SAFE_CELLS_OPTION,
+    STEP_OPTION,
+    CommandOutput,
+    build_result_options,
+    define_command,
+    options_from_dataclass,
+    options_from_parameters,
 )
-from minimax_cal.cli.stderr import AS_JSON, complain, tell
-from minimax_cal.correcting.compensate import HOW, CompensateOptions, Compensation, compensate
-from minimax_cal.correcting.programs.program import LANGUAGES, Program, is_program, read_program
-from minimax_cal.correcting.target_file import TargetFile, read_targets
-from minimax_cal.fitting.opened import open_result
-from minimax_cal.ground.errors import CalibrationError, OptionError
-from minimax_cal.ground.options import Option
-from minimax_cal.ground.words import visible
+from minimax_cal.cli.stderr_events import IS_JSON_PROGRESS, report_error, report_event
+from minimax_cal.compensation.joint_compensation import (
+    COMPENSATION_OPTION_GROUP,
+    CompensateOptions,
+    Compensation,
+    compensate,
+)
+from minimax_cal.compensation.programs.robot_program import (
+    LANGUAGE_BY_FILE_ENDING,
+    RobotProgram,
+    is_robot_program_file,
+    read_robot_program,
+)
+from minimax_cal.compensation.target_file import TargetFile, read_target_file
+from minimax_cal.core.display_text import replace_control_characters
+from minimax_cal.core.errors import CalibrationError, OptionError
+from minimax_cal.core.option_fields import Option
+from minimax_cal.fitting.opened_results import open_result
 from minimax_cal.robots.robot import Robot, load_robot
 
 
-@command
-@FIT
-@click.argument("targets", type=PATH)
-@options_of(
+@define_command
+@FIT_ARGUMENT
+@click.argument("targets", type=PATH_TYPE)
+@options_from_parameters(
     compensate,
-    HOW,
+    COMPENSATION_OPTION_GROUP,
     nominal=Option(
         "The nominal robot of the controller, file or name [default: that of the fit].",
         flag="--robot",
     ),
 )
-@options_from(CompensateOptions)
-@options_of(
-    read_program,
-    HOW,
+@options_from_dataclass(CompensateOptions)
+@options_from_parameters(
+    read_robot_program,
+    COMPENSATION_OPTION_GROUP,
     tool=Option(
         "The tool of a program: x,y,z,q1,q2,q3,q4 in mm, or one that it declares.", metavar="FRAME"
     ),
     wobj=Option("The work object of a program, in the same way.", metavar="FRAME"),
 )
-@SAFE_CELLS
-@RUNG
-@result_options("the targets (CSV, or the program)")
+@SAFE_CELLS_OPTION
+@STEP_OPTION
+@build_result_options("the targets (CSV, or the program)")
 def compensate_command(
     fit: Path,
     targets: Path,
@@ -61,7 +71,7 @@ def compensate_command(
     tool: str,
     wobj: str,
     safe_cells: bool,
-    to: Output,
+    to: CommandOutput,
     **chosen: Any,
 ) -> int:
     """Correct joint TARGETS, or a whole program, for the robot of FIT.
@@ -70,57 +80,65 @@ def compensate_command(
     a whole program: a RAPID module (.mod) or KRL (.src, .dat), whose points alone are changed.
     Without -o the corrected file goes to stdout, its summary to stderr.
     """
-    check_alike(targets, to.output)
+    check_same_file_kind(targets, to.output)
     robot = None if nominal is None else load_robot(nominal)
-    given: Program | TargetFile
-    if is_program(targets):
-        given = read_program(targets, robot or nominal_of(fit, chosen["rung"]), tool, wobj)
+    given: RobotProgram | TargetFile
+    if is_robot_program_file(targets):
+        given = read_robot_program(
+            targets, robot or load_nominal_robot(fit, chosen["rung"]), tool, wobj
+        )
     elif tool or wobj:
         raise OptionError("--tool and --wobj go with a program (.mod, .src, .dat)")
     else:
-        given = read_targets(targets)
+        given = read_target_file(targets)
     found = compensate(fit, given.data, robot, **chosen)
-    text = given.corrected(found)
-    text = to.cells(text, safe_cells) if isinstance(text, str) else text
-    to.finish(found, rows=lambda: text, show=lambda: show_corrected(found, text, to))
-    return complain(found.complaint()) if found.missed else 0
+    text = given.format_corrected(found)
+    text = to.escape_formula_cells(text, safe_cells) if isinstance(text, str) else text
+    to.write_and_print_result(
+        found, rows=lambda: text, show=lambda: print_corrected_targets(found, text, to)
+    )
+    return report_error(found.complaint()) if found.missed else 0
 
 
-def show_corrected(found: Compensation, text: str | bytes, to: Output) -> None:
+def print_corrected_targets(
+    compensation: Compensation, corrected_text: str | bytes, output: CommandOutput
+) -> None:
     """The summary where the targets went to a file; else the targets, and the summary beside."""
-    if to.output:
-        click.echo(found.summary(WIDTH))
+    if output.output:
+        click.echo(compensation.summary(PIPED_OUTPUT_WIDTH))
         return
     if sys.stdout.isatty():
-        text = on_terminal(text if isinstance(text, str) else text.decode("latin-1"))
-    click.echo(text, nl=False)
-    if AS_JSON.get() and not to.quiet:
-        tell("summary", found.headline())
-    elif not to.quiet:
-        click.echo(found.summary(WIDTH), err=True)
+        corrected_text = replace_control_characters_in_lines(
+            corrected_text if isinstance(corrected_text, str) else corrected_text.decode("latin-1")
+        )
+    click.echo(corrected_text, nl=False)
+    if IS_JSON_PROGRESS.get() and not output.quiet:
+        report_event("summary", compensation.headline())
+    elif not output.quiet:
+        click.echo(compensation.summary(PIPED_OUTPUT_WIDTH), err=True)
 
 
-def check_alike(targets: Path, out: Path | None) -> None:
+def check_same_file_kind(targets_path: Path, output_path: Path | None) -> None:
     """Raise OptionError for a program into a file that other endings name, or CSV into one."""
-    if out is None:
+    if output_path is None:
         return
-    own = LANGUAGES.get(targets.suffix.lower())
-    other = LANGUAGES.get(out.suffix.lower())
-    if other is not own and (other or out.suffix.lower() == ".csv"):
-        end = targets.suffix.lower() if own else ".csv"
+    own = LANGUAGE_BY_FILE_ENDING.get(targets_path.suffix.lower())
+    other = LANGUAGE_BY_FILE_ENDING.get(output_path.suffix.lower())
+    if other is not own and (other or output_path.suffix.lower() == ".csv"):
+        end = targets_path.suffix.lower() if own else ".csv"
         raise OptionError(
-            f"{out}: {targets} is corrected into a file of its own kind; end it {end}"
+            f"{output_path}: {targets_path} is corrected into a file of its own kind; end it {end}"
         )
 
 
-def nominal_of(fit: Path, rung: int | None) -> Robot:
+def load_nominal_robot(fit_path: Path, step_number: int | None) -> Robot:
     """The arm that the controller believes in.  Raises CalibrationError."""
-    nominal = open_result(fit, rung).nominal
+    nominal = open_result(fit_path, step_number).nominal
     if nominal is None:
-        raise CalibrationError(f"{fit}: does not tell its nominal robot; give --robot")
+        raise CalibrationError(f"{fit_path}: does not tell its nominal robot; give --robot")
     return nominal.robot
 
 
-def on_terminal(text: str) -> str:
+def replace_control_characters_in_lines(text: str) -> str:
     """A file for people to look at: its cells may hold codes that move a cursor."""
-    return "".join(f"{visible(line)}\n" for line in text.splitlines())
+    return "".join(f"{replace_control_characters(line)}\n" for line in text.splitlines())

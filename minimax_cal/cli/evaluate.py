@@ -8,44 +8,49 @@ from pathlib import Path
 import click
 
 from minimax_cal.cli.options import (
-    DATA,
-    FIT,
-    PATH,
-    RUNG,
-    Output,
-    command,
-    options_of,
-    result_options,
+    DATA_ARGUMENT,
+    FIT_ARGUMENT,
+    PATH_TYPE,
+    STEP_OPTION,
+    CommandOutput,
+    build_result_options,
+    define_command,
+    options_from_parameters,
 )
-from minimax_cal.dynamics.budget import MotionEvaluation, evaluate_motion
+from minimax_cal.core.errors import CalibrationError, OptionError
+from minimax_cal.core.files import read_saved_json
+from minimax_cal.core.option_fields import Option
+from minimax_cal.dynamics.cross_validation import MotionEvaluation, evaluate_motion
 from minimax_cal.dynamics.result import MotionDiagnosis
-from minimax_cal.ground.errors import CalibrationError, OptionError
-from minimax_cal.ground.files import saved_content
-from minimax_cal.ground.options import Option
-from minimax_cal.judging.saved import Evaluation, evaluated
+from minimax_cal.validation.evaluation import Evaluation, evaluate_with_notices
 
 
-def kind_of_file(path: Path) -> str:
+def read_result_kind(path: Path) -> str:
     """The kind that a result file says; empty where it says none."""
     with suppress(CalibrationError):
-        return str(saved_content(path).get("kind", ""))
+        return str(read_saved_json(path).get("kind", ""))
     return ""
 
 
-@command
-@FIT
-@DATA
-@click.argument("more", type=PATH, nargs=-1)
-@RUNG
-@options_of(
-    evaluated,
+@define_command
+@FIT_ARGUMENT
+@DATA_ARGUMENT
+@click.argument("more", type=PATH_TYPE, nargs=-1)
+@STEP_OPTION
+@options_from_parameters(
+    evaluate_with_notices,
     new_frame=Option(
         "The instrument or the base stands elsewhere than in FIT: fit its frame, six numbers."
     ),
 )
-@result_options("the accuracy (JSON)")
+@build_result_options("the accuracy (JSON)")
 def evaluate_command(
-    fit: Path, data: Path, more: tuple[Path, ...], rung: int | None, new_frame: bool, to: Output
+    fit: Path,
+    data: Path,
+    more: tuple[Path, ...],
+    rung: int | None,
+    new_frame: bool,
+    to: CommandOutput,
 ) -> int:
     """Accuracy of a saved calibration FIT on the measurements in DATA.
 
@@ -55,10 +60,10 @@ def evaluate_command(
     judged.
     """
     found: Evaluation | MotionEvaluation
-    if kind_of_file(fit) == MotionDiagnosis.KIND:
+    if read_result_kind(fit) == MotionDiagnosis.KIND:
         found = evaluate_motion(fit, (data, *more))
     elif more:
         raise OptionError(f"{more[0]}: evaluate takes one file of measurements; join them first")
     else:
-        found = evaluated(fit, data, rung, new_frame)
-    return to.finish(found)
+        found = evaluate_with_notices(fit, data, rung, new_frame)
+    return to.write_and_print_result(found)

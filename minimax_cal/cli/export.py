@@ -7,51 +7,56 @@ from typing import Any
 import click
 
 from minimax_cal.cli.options import (
-    JSON,
-    QUIET,
-    RUNG,
-    Output,
-    command,
-    options_from,
-    output,
-    plain_option,
-    with_output,
+    JSON_OPTION,
+    QUIET_AND_PROGRESS_OPTIONS,
+    STEP_OPTION,
+    CommandOutput,
+    define_command,
+    group_option,
+    options_from_dataclass,
+    output_option,
+    pass_output_to_command,
 )
-from minimax_cal.correcting.export import FORMAT, ExportOptions, exported, written
-from minimax_cal.correcting.exporters.table import FORMATS
-from minimax_cal.ground.files import json_text
+from minimax_cal.compensation.exporters.export_formats import DOCUMENTED_EXPORT_FORMATS
+from minimax_cal.compensation.robot_export import (
+    EXPORT_OPTION_GROUP,
+    ExportOptions,
+    build_export,
+    write_exported_files,
+)
+from minimax_cal.core.files import format_json
 
 
-@command
+@define_command
 @click.argument("fit")
-@plain_option(
-    FORMAT,
+@group_option(
+    EXPORT_OPTION_GROUP,
     "--to",
     "kind",
     required=True,
     metavar="FORMAT",
-    help=f"The format: {', '.join(FORMATS)}.",
+    help=f"The format: {', '.join(DOCUMENTED_EXPORT_FORMATS)}.",
 )
-@options_from(ExportOptions)
-@RUNG
-@JSON
-@output("the robot")
-@QUIET
-@with_output(rows=True)
-def export_command(fit: str, kind: str, to: Output, **chosen: Any) -> int:
+@options_from_dataclass(ExportOptions)
+@STEP_OPTION
+@JSON_OPTION
+@output_option("the robot")
+@QUIET_AND_PROGRESS_OPTIONS
+@pass_output_to_command(can_write_csv=True)
+def export_command(fit: str, kind: str, to: CommandOutput, **chosen: Any) -> int:
     """Write the robot of FIT as a file that others can load.
 
     FIT is a saved result or a robot.  The geometry is fitted again for exactly the effects that the
     format carries.  With --json its own accuracy goes to stdout, and the file to -o alone.
     """
-    made = exported(fit, kind, to.output, ExportOptions(**chosen))
+    made = build_export(fit, kind, to.output, ExportOptions(**chosen))
     if to.output or not to.as_json:
-        written(made.file, to.output)
+        write_exported_files(made.file, to.output)
     own = [made.delivered.sentence()] if made.delivered else []
-    to.notice(*made.file.notices, *own)
-    to.wrote(to.output, accuracy="".join(own))
+    to.print_notices(*made.file.notices, *own)
+    to.report_written_files(to.output, accuracy="".join(own))
     if to.as_json:
-        click.echo(json_text(made.to_dict()), nl=False)
+        click.echo(format_json(made.to_dict()), nl=False)
     elif not to.output:
         click.echo(made.file.content, nl=False)
     return 0

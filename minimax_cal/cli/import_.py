@@ -9,37 +9,37 @@ from typing import Any
 import click
 
 from minimax_cal.cli.options import (
-    JSON,
-    PATH,
-    QUIET,
-    SAFE_CELLS,
-    Output,
-    command,
-    flag,
-    options_of,
-    output,
-    plain_option,
-    refuse,
-    show,
-    with_output,
+    JSON_OPTION,
+    PATH_TYPE,
+    QUIET_AND_PROGRESS_OPTIONS,
+    SAFE_CELLS_OPTION,
+    CommandOutput,
+    define_command,
+    flag_option,
+    group_option,
+    options_from_parameters,
+    output_option,
+    pass_output_to_command,
+    print_tables,
+    refuse_given_options,
 )
-from minimax_cal.dynamics.logs import LogFiles, are_logs, import_logs
-from minimax_cal.ground.files import json_text, plain
-from minimax_cal.ground.options import Option
-from minimax_cal.ground.tables import Table
+from minimax_cal.core.files import format_json, to_plain_json
+from minimax_cal.core.option_fields import Option
+from minimax_cal.core.tables import Table
+from minimax_cal.dynamics.logs import LogFiles, are_logs, read_log_files
 from minimax_cal.measuring.importers import Imported, import_files
-from minimax_cal.measuring.measurements import measurements_in
-from minimax_cal.reading.rows import read_rows
-from minimax_cal.reading.sheet import sheet_of
+from minimax_cal.measuring.measurements import build_measurements
+from minimax_cal.reading.measurement_table import read_measurement_table
+from minimax_cal.reading.text_sheet import build_text_sheet
 
-TOLD = "What the files do not tell"
+IMPORT_OPTION_GROUP = "What the files do not tell"
 
 
-@command
-@click.argument("files", nargs=-1, required=True, type=PATH, metavar="FILE...")
-@options_of(
+@define_command
+@click.argument("files", nargs=-1, required=True, type=PATH_TYPE, metavar="FILE...")
+@options_from_parameters(
     import_files,
-    TOLD,
+    IMPORT_OPTION_GROUP,
     joints=Option("The file of joint values, where FILE holds points only.", read=Path),
     columns=Option(
         "What the columns are, in order: smr1_mm,smr2_mm,smr3_mm,q_deg (skip*2 leaves two out), or "
@@ -61,16 +61,16 @@ TOLD = "What the files do not tell"
     ),
     decimal=Option("The decimal sign.", metavar="[point|comma]"),
 )
-@plain_option(
-    TOLD,
+@group_option(
+    IMPORT_OPTION_GROUP,
     "--leave-out",
     multiple=True,
     metavar="POINTS[=WHY]",
     help="Points to set aside, and why: 12:smr2 is that of line 12, 12 all of its pose; several "
     "with commas, the reason after an equals sign.",
 )
-@plain_option(
-    TOLD,
+@group_option(
+    IMPORT_OPTION_GROUP,
     "--mend",
     multiple=True,
     metavar="HOW",
@@ -78,19 +78,19 @@ TOLD = "What the files do not tell"
     "shift=1@40.. from line 40 on), reverse (points in the opposite order), joints=1:3:2:4:5:6 "
     "(columns of joints 2 and 3 swapped), scale=0.999 (of the points).",
 )
-@flag("--preview", help="Show the first rows as they were understood.")
-@SAFE_CELLS
-@JSON
-@QUIET
-@output("the measurements (CSV), or to a .json what was understood,")
-@with_output(rows=True)
+@flag_option("--preview", help="Show the first rows as they were understood.")
+@SAFE_CELLS_OPTION
+@JSON_OPTION
+@QUIET_AND_PROGRESS_OPTIONS
+@output_option("the measurements (CSV), or to a .json what was understood,")
+@pass_output_to_command(can_write_csv=True)
 def import_command(
     files: tuple[Path, ...],
     leave_out: tuple[str, ...],
     mend: tuple[str, ...],
     preview: bool,
     safe_cells: bool,
-    to: Output,
+    to: CommandOutput,
     **chosen: Any,
 ) -> int:
     """Read FILEs of a tracker or controller as they are and write CSV.
@@ -100,29 +100,41 @@ def import_command(
     """
     if not chosen["joints"] and not chosen["columns"] and are_logs(files):
         idle = {*chosen, "leave_out", "mend", "preview"} - {"units"}
-        refuse(idle, f"is about measured points, and {files[0]} is a log")
-        logs = import_logs(files, units=chosen["units"])
-        return finish(logs, to, lambda: to.cells(logs.csv(), safe_cells), logs.table())
-    found = import_files(files, **chosen).put_right(mend, leave_out)
+        refuse_given_options(idle, f"is about measured points, and {files[0]} is a log")
+        logs = read_log_files(files, units=chosen["units"])
+        return write_and_print_import(
+            logs, to, lambda: to.escape_formula_cells(logs.format_csv(), safe_cells), logs.table()
+        )
+    found = import_files(files, **chosen).with_mends(mend, leave_out)
 
     def rows() -> str:
-        text = to.cells(found.csv(), safe_cells)
-        measurements_in(read_rows(sheet_of(to.output or "", text)))  # it can be read again
+        text = to.escape_formula_cells(found.csv(), safe_cells)
+        build_measurements(
+            read_measurement_table(build_text_sheet(to.output or "", text))
+        )  # it can be read again
         return text
 
     tables = (found.files(), *found.columns(), *[found.preview()] * preview)
-    return finish(found, to, rows, *tables, said=found.headline())
+    return write_and_print_import(found, to, rows, *tables, summary=found.headline())
 
 
-def finish(
-    found: Imported | LogFiles, to: Output, rows: Callable[[], str], *tables: Table, said: str = ""
+def write_and_print_import(
+    imported: Imported | LogFiles,
+    output: CommandOutput,
+    make_csv: Callable[[], str],
+    *tables: Table,
+    summary: str = "",
 ) -> int:
     """Write and show what was understood."""
-    content = {"schema": 1, "output": to.output and str(to.output), **found.to_dict()}
-    wanted = to.deliver(lambda: json_text(plain(content)), rows=rows)
-    to.notice(*content["notices"])
+    content = {"schema": 1, "output": output.output and str(output.output), **imported.to_dict()}
+    wanted = output.write_result_or_print_json(
+        lambda: format_json(to_plain_json(content)), make_csv=make_csv
+    )
+    output.print_notices(*content["notices"])
     if wanted:
-        show(*tables)
-        for line in filter(None, (said, "" if to.output else "nothing written; add -o FILE")):
+        print_tables(*tables)
+        for line in filter(
+            None, (summary, "" if output.output else "nothing written; add -o FILE")
+        ):
             click.echo(line)
     return 0

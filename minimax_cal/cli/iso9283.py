@@ -7,46 +7,53 @@ from pathlib import Path
 from typing import Any
 
 from minimax_cal.cli.options import (
-    FIT,
-    RUNG,
-    SOME_DATA,
-    Output,
-    command,
-    options_of,
-    plain_option,
-    result_options,
+    FIT_ARGUMENT,
+    OPTIONAL_DATA_ARGUMENT,
+    STEP_OPTION,
+    CommandOutput,
+    build_result_options,
+    define_command,
+    group_option,
+    options_from_parameters,
 )
-from minimax_cal.ground.options import Option, numbers
-from minimax_cal.judging.standard import iso9283
+from minimax_cal.core.option_fields import Option, parse_finite_numbers
+from minimax_cal.validation.iso9283_of_result import iso9283
 
-WHAT = "What is judged"
+ISO9283_OPTION_GROUP = "What is judged"
 
 
-def point_of(text: str) -> str | Sequence[float]:
+def parse_tool_centre_point(text: str) -> str | Sequence[float]:
     """The TCP: a name as it is, or X,Y,Z in mm [m].  Raises OptionError."""
     if "," not in text:
         return text
-    return [1e-3 * part for part in numbers(text, "tcp", "centroid, a target, or X,Y,Z in mm")]
+    return [
+        1e-3 * part
+        for part in parse_finite_numbers(text, "tcp", "centroid, a target, or X,Y,Z in mm")
+    ]
 
 
-@command
-@FIT
-@SOME_DATA
-@options_of(
+@define_command
+@FIT_ARGUMENT
+@OPTIONAL_DATA_ARGUMENT
+@options_from_parameters(
     iso9283,
-    WHAT,
+    ISO9283_OPTION_GROUP,
     nominal=Option("The robot before calibration, file or name [default: of the fit]."),
     tcp=Option(
         "The tool centre point: centroid of the targets, one target (smr1), or X,Y,Z in mm in the "
         "last frame.",
         metavar="POINT",
-        read=point_of,
+        read=parse_tool_centre_point,
     ),
 )
-@plain_option(WHAT, "--poses", is_flag=True, help="Print a row for every pose, too.")
-@RUNG
-@result_options("the values (JSON)")
-def iso9283_command(fit: Path, data: Path | None, poses: bool, to: Output, **chosen: Any) -> int:
+@group_option(
+    ISO9283_OPTION_GROUP, "--poses", is_flag=True, help="Print a row for every pose, too."
+)
+@STEP_OPTION
+@build_result_options("the values (JSON)")
+def iso9283_command(
+    fit: Path, data: Path | None, poses: bool, to: CommandOutput, **chosen: Any
+) -> int:
     """Pose and distance accuracy of FIT by the formulas of ISO 9283, before and after.
 
     FIT is what `calibrate`, `diagnose` or `relative` wrote with -o, DATA the measurements [default:
@@ -54,4 +61,4 @@ def iso9283_command(fit: Path, data: Path | None, poses: bool, to: Output, **cho
     again give repeatability.
     """
     found = iso9283(fit, data, **chosen)
-    return to.finish(found, tables=lambda: found.tables(poses=poses))
+    return to.write_and_print_result(found, tables=lambda: found.tables(poses=poses))

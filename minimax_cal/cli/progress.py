@@ -13,13 +13,16 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from minimax_cal.cli.stderr import AS_JSON, tell
-from minimax_cal.ground.stages import Stage, clock, silent
+from minimax_cal.cli.stderr_events import IS_JSON_PROGRESS, report_event
+from minimax_cal.core.progress_stages import ProgressStage, format_duration, silent_progress
 
-FIRST, EVERY = 1.0, 10.0  # seconds to the first line, and between lines, without a terminal
+SECONDS_TO_FIRST_PROGRESS_LINE, SECONDS_BETWEEN_PROGRESS_LINES = (
+    1.0,
+    10.0,
+)  # seconds to the first line, and between lines, without a terminal
 
 
-class Stages:
+class StageClock:
     """What the work is at, since when, and how long it will take where its steps are counted."""
 
     def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
@@ -27,7 +30,7 @@ class Stages:
         self.began = self.counting = now()
         self.kind = ""
 
-    def times(self, stage: Stage) -> tuple[float, float | None]:
+    def elapsed_and_remaining_seconds(self, stage: ProgressStage) -> tuple[float, float | None]:
         """Seconds so far, and seconds left of stages that count, None of others."""
         now = self.now()
         if stage.kind != self.kind:
@@ -37,15 +40,18 @@ class Stages:
             return now - self.began, None
         return now - self.began, (now - self.counting) / done * (stage.parts - done)
 
-    def line(self, text: str) -> str:
+    def format_stage(self, stage_text: str) -> str:
         """A stage with the time so far, and the time left of those that count."""
-        seconds, left = self.times(as_stage(text))
-        return f"{text}, {clock(seconds)}{'' if left is None else f', about {clock(left)} left'}"
+        seconds, left = self.elapsed_and_remaining_seconds(to_stage(stage_text))
+        return (
+            f"{stage_text}, {format_duration(seconds)}"
+            f"{'' if left is None else f', about {format_duration(left)} left'}"
+        )
 
-    def event(self, text: str) -> dict[str, Any]:
+    def build_stage_event(self, stage_text: str) -> dict[str, Any]:
         """What a line of JSON holds of a stage, beside its words."""
-        stage = as_stage(text)
-        seconds, left = self.times(stage)
+        stage = to_stage(stage_text)
+        seconds, left = self.elapsed_and_remaining_seconds(stage)
         out: dict[str, Any] = {"seconds": round(seconds, 1)}
         if stage.parts:
             out |= {"part": stage.part, "parts": stage.parts}
@@ -56,72 +62,76 @@ class Stages:
         return out
 
 
-def as_stage(text: str) -> Stage:
+def to_stage(stage_text: str) -> ProgressStage:
     """A stage of words alone is one, too."""
-    return text if isinstance(text, Stage) else Stage(text)
+    return stage_text if isinstance(stage_text, ProgressStage) else ProgressStage(stage_text)
 
 
-class Ticker:
+class ProgressTicker:
     """The last stage and its time, drawn on a terminal as it is then.
 
-    Else a line on stderr: after the first second, then every `EVERY` seconds.
+    Else a line on stderr: after the first second, then every `SECONDS_BETWEEN_PROGRESS_LINES`
+    seconds.
     """
 
-    def __init__(self, shown: Stages) -> None:
-        self.shown, self.text = shown, Stage("reading")
+    def __init__(self, shown: StageClock) -> None:
+        self.shown, self.text = shown, ProgressStage("reading")
         self.over = threading.Event()
 
-    def show(self, text: str) -> None:
+    def start_stage(self, stage_text: str) -> None:
         """A stage has begun; its time counts from now."""
-        self.text = as_stage(text)
-        self.shown.times(self.text)
+        self.text = to_stage(stage_text)
+        self.shown.elapsed_and_remaining_seconds(self.text)
 
     def __rich__(self) -> Text:
-        return Text(self.shown.line(self.text), overflow="ellipsis", no_wrap=True)
+        return Text(self.shown.format_stage(self.text), overflow="ellipsis", no_wrap=True)
 
-    def run(self) -> None:
+    def print_lines_until_over(self) -> None:
         """Print lines until the work is over."""
-        pause = FIRST
+        pause = SECONDS_TO_FIRST_PROGRESS_LINE
         while not self.over.wait(pause):
-            tell("progress", self.shown.line(self.text))
-            pause = EVERY
+            report_event("progress", self.shown.format_stage(self.text))
+            pause = SECONDS_BETWEEN_PROGRESS_LINES
 
 
 @contextmanager
-def ticking(ticker: Ticker) -> Iterator[Callable[[str], None]]:
+def run_progress_ticker(ticker: ProgressTicker) -> Iterator[Callable[[str], None]]:
     """A callback for each stage, of which a thread prints the last now and then."""
     known = copy_context()  # of the command
-    thread = threading.Thread(target=known.run, args=(ticker.run,), name="progress", daemon=True)
+    thread = threading.Thread(
+        target=known.run, args=(ticker.print_lines_until_over,), name="progress", daemon=True
+    )
     thread.start()
     try:
-        yield ticker.show
+        yield ticker.start_stage
     finally:
         ticker.over.set()
         thread.join()
 
 
 @contextmanager
-def stages(quiet: bool) -> Iterator[Callable[[str], None]]:
-    """A callback for each stage: shown on a terminal, else a line every `EVERY` seconds.
+def show_stage_progress(is_quiet: bool) -> Iterator[Callable[[str], None]]:
+    """A callback for each stage: shown on a terminal, else a line every
+    `SECONDS_BETWEEN_PROGRESS_LINES` seconds.
 
     On a terminal the clock ticks, and steps of an error budget stay.  As JSON every stage is a
     line.
     """
-    shown, console = Stages(), Console(stderr=True, quiet=quiet, highlight=False)
-    ticker = Ticker(shown)
+    shown, console = StageClock(), Console(stderr=True, quiet=is_quiet, highlight=False)
+    ticker = ProgressTicker(shown)
 
     def on_terminal(text: str) -> None:
-        ticker.show(text)
+        ticker.start_stage(text)
         if ticker.text.rung:
             console.print(Text(text))  # above the line that ticks
 
-    if quiet:
-        yield silent
-    elif AS_JSON.get():
-        yield lambda text: tell("progress", text, **shown.event(text))
+    if is_quiet:
+        yield silent_progress
+    elif IS_JSON_PROGRESS.get():
+        yield lambda text: report_event("progress", text, **shown.build_stage_event(text))
     elif console.is_terminal:
         with Live(ticker, console=console, transient=True, refresh_per_second=1):
             yield on_terminal
     else:
-        with ticking(ticker) as show:
+        with run_progress_ticker(ticker) as show:
             yield show

@@ -12,57 +12,104 @@ from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
-from minimax_cal.diagnosing.causes import Causes, remaining_beside_terms, search_causes
+from minimax_cal.core.arrays import Array
+from minimax_cal.core.display_text import format_first_names
+from minimax_cal.core.errors import DataError
+from minimax_cal.core.option_fields import (
+    check_excluded_effects,
+    option_field_in_group,
+    take_option_fields_as_keywords,
+)
+from minimax_cal.core.progress_stages import begin_numbered_step, build_budget_step_stage
+from minimax_cal.core.threads import limit_blas_to_one_thread
+from minimax_cal.diagnosing.budget_steps import (
+    MENDED_FAULT_NAMES,
+    BudgetSteps,
+    JudgingPoses,
+    explained_fraction,
+    fill_error_fractions,
+    fill_fitted_values,
+)
+from minimax_cal.diagnosing.cause_search import (
+    FoundCauses,
+    find_remaining_beside_terms,
+    search_causes,
+)
 from minimax_cal.diagnosing.clean_data import CleanData, clean_measurements
+from minimax_cal.diagnosing.diagnosis import BudgetStep, Diagnosis, Finding
 from minimax_cal.diagnosing.error_budget import fit_error_budget
-from minimax_cal.diagnosing.findings import describe_faults
-from minimax_cal.diagnosing.folds import beyond_of
-from minimax_cal.diagnosing.foot import asked_foot, foot_notices, foot_tells
-from minimax_cal.diagnosing.gap import FAULTS, Judges, Ladder, closed, valued, with_shares
-from minimax_cal.diagnosing.result import Diagnosis, Finding, Step
-from minimax_cal.diagnosing.set_aside import judged_with
-from minimax_cal.diagnosing.study import SUM, Study, studied
-from minimax_cal.diagnosing.trial import session_notices
-from minimax_cal.diagnosing.verdict import ABOVE_NOISE, down_to, explanation, known_noise
-from minimax_cal.diagnosing.what_remains import remaining_of
-from minimax_cal.diagnosing.where import where
-from minimax_cal.fitting.beyond import Beyond
-from minimax_cal.fitting.crossed import MIN_HELD_POSES
+from minimax_cal.diagnosing.error_locations import locate_errors
+from minimax_cal.diagnosing.extrapolation_test import compare_extrapolation
+from minimax_cal.diagnosing.findings import build_fault_findings
+from minimax_cal.diagnosing.foot_reflectors import (
+    compare_laws_with_reflectors,
+    describe_reflector_agreement,
+    mark_contradicted_findings,
+)
+from minimax_cal.diagnosing.linear_trials import describe_session_changes
+from minimax_cal.diagnosing.remaining_error import split_remaining_error
+from minimax_cal.diagnosing.set_aside_points import accuracy_with_set_aside_points
+from minimax_cal.diagnosing.study import (
+    LEAST_SQUARES_OPTIONS,
+    LinearisedGeometry,
+    linearise_geometry,
+)
+from minimax_cal.diagnosing.verdict import (
+    ABOVE_NOISE_TEXT,
+    estimate_noise_limits,
+    explain_verdict,
+    is_down_to_complete_noise,
+)
+from minimax_cal.fitting.cell_fit import fit_cell
+from minimax_cal.fitting.cross_validation import MIN_HELD_POSES
 from minimax_cal.fitting.fit import Provenance
-from minimax_cal.fitting.floor import DISTANCES, Floor, floor_of, noise_at_most, with_instrument
-from minimax_cal.fitting.judged import warn_of_wrong_robot
-from minimax_cal.fitting.options import Options, Progress, silent
+from minimax_cal.fitting.fit_judgement import warn_of_wrong_robot
+from minimax_cal.fitting.multi_instrument.options import (
+    RELATIVE_OPTION_READERS,
+    RelativeOptions,
+    check_no_instrument_options,
+    merge_instrument_options,
+)
+from minimax_cal.fitting.noise_floor import (
+    DISTANCES,
+    NoiseFloor,
+    estimate_noise_floor,
+    noise_upper_bound_mm,
+    with_u95_of_instrument,
+)
+from minimax_cal.fitting.options import Options, Progress, silent_progress
 from minimax_cal.fitting.outcome import FileEvidence, missed_rows
-from minimax_cal.fitting.several.options import READ, RelativeOptions, check_no_others, with_others
-from minimax_cal.fitting.solve import fit_cell
-from minimax_cal.fitting.stations import place_sessions, warn_of_unplaced_sessions
-from minimax_cal.fitting.suspects import find_contradicting_points
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import DataError
-from minimax_cal.ground.options import check_left_out, grouped, takes
-from minimax_cal.ground.stages import name_rung, number_step
-from minimax_cal.ground.threads import one_thread
-from minimax_cal.ground.words import name_first
-from minimax_cal.instruments.file import Given, InstrumentData, taken
-from minimax_cal.instruments.images import Images
-from minimax_cal.instruments.tracker import Points
-from minimax_cal.measuring import checks
-from minimax_cal.measuring.grouping import clusters, held_out, with_groups
-from minimax_cal.measuring.history import with_history
+from minimax_cal.fitting.outliers import find_contradicting_points
+from minimax_cal.fitting.region_holdout import RegionHoldout
+from minimax_cal.fitting.session_frames import place_sessions, warn_of_unplaced_sessions
+from minimax_cal.instruments.camera_images import CameraImages
+from minimax_cal.instruments.instrument_files import (
+    InstrumentData,
+    InstrumentInput,
+    read_instruments_or_measurements,
+)
+from minimax_cal.instruments.tracker_points import TrackerPoints
+from minimax_cal.measuring import measurement_checks
 from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.measuring.pose_groups import add_group_column, cluster_poses, select_holdout_rows
+from minimax_cal.measuring.visit_history import add_history_columns
+from minimax_cal.modelling.effects.effect_names import format_budget_step
 from minimax_cal.modelling.effects.table import EFFECTS
-from minimax_cal.modelling.effects.time import SESSION_JUMP
-from minimax_cal.modelling.effects.words import name_step
+from minimax_cal.modelling.effects.time_effects import SESSION_JUMP
 from minimax_cal.robots.robot import Robot, RobotSource, load_robot
 
 if TYPE_CHECKING:  # it is slow to import
     from minimax_cal.diagnosing.instruments_result import RelativeDiagnosis
 
-FAULTY, CAUSES, BUDGET = "faults of the data", "testing causes", "error budget"
-PARTS, REMAINING = "regions held out", "remaining error"
-STEPS = (FAULTY, CAUSES, BUDGET, PARTS, REMAINING)
-NOT_ASKED = Beyond(reason="not asked for")
-sought = grouped("What is sought")
+DATA_FAULTS_STAGE, CAUSES_STAGE, BUDGET_STAGE = (
+    "faults of the data",
+    "testing causes",
+    "error budget",
+)
+REGIONS_STAGE, REMAINING_STAGE = "regions held out", "remaining error"
+DIAGNOSIS_STAGES = (DATA_FAULTS_STAGE, CAUSES_STAGE, BUDGET_STAGE, REGIONS_STAGE, REMAINING_STAGE)
+NO_EXTRAPOLATION_TEST = RegionHoldout(reason="not asked for")
+search_option = option_field_in_group("What is sought")
 
 
 @dataclass(frozen=True)
@@ -81,34 +128,34 @@ class DiagnosisOptions:
     holdout: float = Options.holdout
     holdout_by: str | None = None
     instrument: str | None = None
-    exclude: Sequence[str] = sought(
+    exclude: Sequence[str] = search_option(
         (),
         "Do not consider this effect; `minimax-cal effects` lists them.",
         metavar="EFFECT",
         flag="--without",
         many=tuple,
     )
-    quick: bool = sought(
+    quick: bool = search_option(
         False, "Hold out no parts of the poses in turn: no claim outside the measured region."
     )
 
-    def step_of(self, progress: Progress, name: str) -> Progress:
+    def number_stage(self, progress: Progress, stage_name: str) -> Progress:
         """Progress of one of STEPS."""
-        steps = [step for step in STEPS if not (self.quick and step == PARTS)]
-        return number_step(progress, steps.index(name) + 1, len(steps), name)
+        steps = [step for step in DIAGNOSIS_STAGES if not (self.quick and step == REGIONS_STAGE)]
+        return begin_numbered_step(progress, steps.index(stage_name) + 1, len(steps), stage_name)
 
 
-OF_OTHERS = ("offset", "known_distances", "lever", "noises", *Images.options)
+OTHER_INSTRUMENT_OPTIONS = ("offset", "known_distances", "lever", "noises", *CameraImages.options)
 
 
 @overload
 def diagnose(
     robot: RobotSource,
-    data: Measurements | Points,
+    data: Measurements | TrackerPoints,
     *,
     jobs: int = 1,
     cluster: str = "",
-    progress: Progress = silent,
+    progress: Progress = silent_progress,
     **options: Any,
 ) -> Diagnosis: ...
 @overload
@@ -118,31 +165,33 @@ def diagnose(
     *,
     jobs: int = 1,
     cluster: str = "",
-    progress: Progress = silent,
+    progress: Progress = silent_progress,
     **options: Any,
 ) -> RelativeDiagnosis: ...
 @overload
 def diagnose(
     robot: RobotSource,
-    data: Given | Sequence[Given],
+    data: InstrumentInput | Sequence[InstrumentInput],
     *,
     jobs: int = 1,
     cluster: str = "",
-    progress: Progress = silent,
+    progress: Progress = silent_progress,
     **options: Any,
 ) -> Diagnosis | RelativeDiagnosis: ...
-@takes(
-    options=DiagnosisOptions, others=(RelativeOptions, OF_OTHERS), read={**READ, "exclude": list}
+@take_option_fields_as_keywords(
+    options=DiagnosisOptions,
+    others=(RelativeOptions, OTHER_INSTRUMENT_OPTIONS),
+    readers_by_field={**RELATIVE_OPTION_READERS, "exclude": list},
 )
 def diagnose(
     robot: Robot | str | Path,
-    data: Given | Sequence[Given],
+    data: InstrumentInput | Sequence[InstrumentInput],
     *,
     options: DiagnosisOptions,
     others: RelativeOptions,
     jobs: int = 1,
     cluster: str = "",
-    progress: Progress = silent,
+    progress: Progress = silent_progress,
 ) -> Diagnosis | RelativeDiagnosis:
     """Say what is still wrong with a calibrated robot, and why, as far as the data can tell.
 
@@ -180,25 +229,25 @@ def diagnose(
     """
     began = time.perf_counter()
     robot = load_robot(robot)
-    given = taken(data)
+    given = read_instruments_or_measurements(data)
     if not isinstance(given, Measurements):
-        from minimax_cal.diagnosing.instruments import diagnosed
+        from minimax_cal.diagnosing.diagnose_instruments import diagnose_with_options
 
-        chosen = with_others(given, replace(options, exclude=()), others)
-        return diagnosed(robot, given, options.exclude, chosen, progress)
-    check_no_others(given, others)
-    check_left_out(options.exclude, EFFECTS)
-    given = checks.check_joints(robot, given)
-    checks.check_spread(robot, given)
-    raw = with_groups(with_history(with_instrument(given, options.instrument)))
-    held, notices = held_out(raw, options.holdout, options.seed, options.holdout_by)
+        chosen = merge_instrument_options(given, replace(options, exclude=()), others)
+        return diagnose_with_options(robot, given, options.exclude, chosen, progress)
+    check_no_instrument_options(given, others)
+    check_excluded_effects(options.exclude, EFFECTS)
+    given = measurement_checks.check_and_complete_joints(robot, given)
+    measurement_checks.check_point_spread(robot, given)
+    raw = add_group_column(add_history_columns(with_u95_of_instrument(given, options.instrument)))
+    held, notices = select_holdout_rows(raw, options.holdout, options.seed, options.holdout_by)
     if not held.any():
         raise DataError(
             f"{given.source}: no pose is held out; a diagnosis needs some that no fit has seen: "
             "measure more poses, or hold out more (holdout)"
         )
     judges = raw.take(held)
-    if len(np.unique(clusters(judges))) < MIN_HELD_POSES:
+    if len(np.unique(cluster_poses(judges))) < MIN_HELD_POSES:
         few = (
             f"only {judges.poses} poses are held out: what is said of new poses rests on these; "
             "calibrate with the effects found judges every pose by a fit without it"
@@ -206,81 +255,102 @@ def diagnose(
         notices = (*notices, few)
     notices = (*notices, *warn_of_unplaced_sessions(raw, ~held))
     raw = place_sessions(robot, raw, ~held)
-    with one_thread():
-        return examine(robot, raw, held, options, notices, progress, began, (jobs, cluster))
+    with limit_blas_to_one_thread():
+        return diagnose_checked_measurements(
+            robot, raw, held, options, notices, progress, began, (jobs, cluster)
+        )
 
 
-def examine(
+def diagnose_checked_measurements(
     robot: Robot,
-    given: Measurements,
-    held: Array,
+    measurements: Measurements,
+    holdout_mask: Array,
     options: DiagnosisOptions,
     notices: tuple[str, ...],
     progress: Progress,
-    began: float,
+    start_time: float,
     workers: tuple[int, str],
 ) -> Diagnosis:
     """The diagnosis of checked measurements.
 
-    held: (m,) True for poses that no fit may see.  began: when the work did [s].  workers:
-    processes, and the address of a Dask scheduler.
+    holdout_mask: (m,) True for poses that no fit may see.  start_time: when the work did [s].
+    workers: processes, and the address of a Dask scheduler.
     """
-    step_of, held_lines = partial(options.step_of, progress), given.line[held]
-    clean = clean_measurements(robot, given, held_lines, step_of(FAULTY))
+    step_of, held_lines = partial(options.number_stage, progress), measurements.line[holdout_mask]
+    clean = clean_measurements(robot, measurements, held_lines, step_of(DATA_FAULTS_STAGE))
     train = clean.data.take(~np.isin(clean.data.line, held_lines))
-    judges = Judges.of(given.take(held), clean.measured, clean.data, train, options.holdout_by)
-    fit = clean.fit or fit_cell(robot, train, SUM, progress)
-    study = replace(studied(robot, train, fit), moments=clean.jump_times)
+    judges = JudgingPoses.from_measurements(
+        measurements.take(holdout_mask), clean.measured, clean.data, train, options.holdout_by
+    )
+    fit = clean.fit or fit_cell(robot, train, LEAST_SQUARES_OPTIONS, progress)
+    study = replace(linearise_geometry(robot, train, fit), jump_times=clean.jump_times)
 
     # Causes, their budget, and how well these extrapolate: where worse than geometry, none of them
     # is recommended.
-    study, causes = search_causes(study, clean.faults, options.exclude, step_of(CAUSES), *workers)
-    causes, spoken, ladder = fit_error_budget(study, causes, step_of(BUDGET))
-    beyond = NOT_ASKED if options.quick else beyond_of(study, causes, judges, step_of(PARTS))
+    study, causes = search_causes(
+        study, clean.faults, options.exclude, step_of(CAUSES_STAGE), *workers
+    )
+    causes, spoken, ladder = fit_error_budget(study, causes, step_of(BUDGET_STAGE))
+    beyond = (
+        NO_EXTRAPOLATION_TEST
+        if options.quick
+        else compare_extrapolation(study, causes, judges, step_of(REGIONS_STAGE))
+    )
     refused = math.nan
     if beyond.typical_mm > beyond.geometric_typical_mm:
         causes, spoken = (
             replace(one, effects=tuple(replace(f, extends=not f.established) for f in one.effects))
             for one in (causes, spoken)
         )
-        ladder, refused = replace(ladder, sure=0), beyond.typical_mm
-        beyond = beyond_of(study, causes, judges, silent)
-    kept = ladder.confirmed
-    causes = replace(causes, left=remaining_beside_terms(study, causes, kept.last.terms))
+        ladder, refused = replace(ladder, confirmed_count=0), beyond.typical_mm
+        beyond = compare_extrapolation(study, causes, judges, silent_progress)
+    kept = ladder.confirmed_steps
+    causes = replace(
+        causes, remaining_components=find_remaining_beside_terms(study, causes, kept.last_fit.terms)
+    )
 
     # Steps on held-out poses, and the noise beneath the last one that is recommended.
-    last, late = judges.marked(kept.fits[0].cell, kept.last.cell)
+    last, late = judges.mark_outliers(kept.joint_fits[0].cell, kept.last_fit.cell)
     spoilt = None
-    if any(f.effect in FAULTS for f in causes.faults):
-        spoilt = given.take(~np.isin(given.line, held_lines))
-    steps = judge_steps(study, last, spoken, ladder, spoilt)
+    if any(f.effect in MENDED_FAULT_NAMES for f in causes.faults):
+        spoilt = measurements.take(~np.isin(measurements.line, held_lines))
+    steps = judge_budget_steps(study, last, spoken, ladder, spoilt)
     for one in steps:
-        progress(name_rung(name_step(one.name), one.holdout.rms_mm))
-    count = len(steps) - len(ladder.taken) + ladder.sure
+        progress(build_budget_step_stage(format_budget_step(one.name), one.holdout.rms_mm))
+    count = len(steps) - len(ladder.taken_numbers) + ladder.confirmed_count
     step = steps[count - 1]
     judge = step.trusted if step.trusted.poses else step.train
-    error = kept.last.cell.error(clean.data)
-    most = noise_at_most(error, kept.last.poses.left_free)
-    whole = floor_of(clean.data, error, robot.repeatability, most)
-    floor = whole.beneath(judge.rms_mm)  # noise is part of what is left
-    share, interval = closed(kept, last, floor, options.seed)
-    effects = [*valued(spoken.effects, kept), *valued(spoken.effects, ladder)[ladder.sure :]]
-    foot = tuple(foot_tells(kept.last, clean.data))
-    effects = [*asked_foot(effects, foot)]
-    findings = with_shares([*describe_faults(causes.faults), *effects], steps, floor.least)
+    error = kept.last_fit.cell.error(clean.data)
+    most = noise_upper_bound_mm(error, kept.last_fit.pose_linearisation.degrees_of_freedom)
+    whole = estimate_noise_floor(clean.data, error, robot.repeatability, most)
+    floor = whole.limited_by_error(judge.rms_mm)  # noise is part of what is left
+    share, interval = explained_fraction(kept, last, floor, options.seed)
+    effects = [
+        *fill_fitted_values(spoken.effects, kept),
+        *fill_fitted_values(spoken.effects, ladder)[ladder.confirmed_count :],
+    ]
+    foot = tuple(compare_laws_with_reflectors(kept.last_fit, clean.data))
+    effects = [*mark_contradicted_findings(effects, foot)]
+    findings = fill_error_fractions(
+        [*build_fault_findings(causes.faults), *effects], steps, floor.lower_limit_mm
+    )
 
     # The verdict, by all that is known of the noise.
-    step_of(REMAINING)
-    known = known_noise(kept.last, whole, clean.data, robot.repeatability)
-    wrong = explain_contradiction(robot, floor, step)
-    gone, counted = judged_with(given, clean.data, clean.left_out, judges.held, kept.last.cell)
-    told = explanation(findings, causes, known, study.fit.status, failed=bool(wrong))
-    left = () if told["verdict"] == "not_repeatable" else causes.left  # it scatters, that is all
-    most = floor.value if told["structure_in"] == ABOVE_NOISE else math.inf
-    rest, complete = remaining_of(left, judge.rms_mm, clean.data, error, most)
-    more = ladder.last.cell if len(steps) > count else None
+    step_of(REMAINING_STAGE)
+    known = estimate_noise_limits(kept.last_fit, whole, clean.data, robot.repeatability)
+    wrong = describe_contradiction(robot, floor, step)
+    gone, counted = accuracy_with_set_aside_points(
+        measurements, clean.data, clean.left_out, judges.heldout_measurements, kept.last_fit.cell
+    )
+    told = explain_verdict(findings, causes, known, study.fit.status, is_contradicted=bool(wrong))
+    left = (
+        () if told["verdict"] == "not_repeatable" else causes.remaining_components
+    )  # it scatters, that is all
+    most = floor.value if told["structure_in"] == ABOVE_NOISE_TEXT else math.inf
+    rest, complete = split_remaining_error(left, judge.rms_mm, clean.data, error, most)
+    more = ladder.last_fit.cell if len(steps) > count else None
     return Diagnosis(
-        **{**told, "meets_floor": down_to(known, complete)},
+        **{**told, "meets_floor": is_down_to_complete_noise(known, complete)},
         robot=robot.name,
         ladder=tuple(steps[:count]),
         possible=steps[-1] if more else None,
@@ -289,24 +359,26 @@ def examine(
         closed=share,
         closed_ci=interval,
         beyond=beyond,
-        noise=float(np.sqrt(study.uneven * causes.choice.noise.variance)),  # of a mean coordinate
-        where=where(study).to_dict(),
+        noise=float(
+            np.sqrt(study.variance_anisotropy * causes.selection.noise.variance)
+        ),  # of a mean coordinate
+        where=locate_errors(study).to_dict(),
         notices=(
-            *given.notices,
+            *measurements.notices,
             *notices,
-            *notices_of(study, clean, kept, late, effects),
-            *foot_notices(foot),
-            *warn_of_wrong_robot(study.robot, study.fit, study.nominal.error(study.data)),
+            *list_notices(study, clean, kept, late, effects),
+            *describe_reflector_agreement(foot),
+            *warn_of_wrong_robot(study.robot, study.fit, study.nominal_cell.error(study.data)),
             *filter(None, [wrong]),
         ),
-        provenance=Provenance.of(robot, given, vars(options)),
-        seconds=time.perf_counter() - began,
-        data=study.geometric.placed(clean.data),
+        provenance=Provenance.from_run(robot, measurements, vars(options)),
+        seconds=time.perf_counter() - start_time,
+        data=study.geometric_cell.align_to_first_session(clean.data),
         held=~np.isin(clean.data.line, train.line),
-        cells=tuple(fit.cell for fit in kept.fits),
-        nominal=study.nominal,
+        cells=tuple(fit.cell for fit in kept.joint_fits),
+        nominal=study.nominal_cell,
         remaining=None if wrong else rest,
-        tested=(known.remaining, known.highest),
+        tested=(known.lowest_error_mm, known.highest_noise_mm),
         refused=refused,
         floor_known=complete,
         repeatable=known.is_repeatable,
@@ -315,54 +387,67 @@ def examine(
     )
 
 
-def notices_of(
-    study: Study,
-    clean: CleanData,
-    ladder: Ladder,
-    late: tuple[str, ...],
+def list_notices(
+    study: LinearisedGeometry,
+    clean_data: CleanData,
+    budget: BudgetSteps,
+    late_outliers: tuple[str, ...],
     effects: Sequence[Finding],
 ) -> Iterator[str]:
     """What the reader should know.
 
-    late: outliers that the gap had hidden.  effects: with the values of the last fit.
+    late_outliers: outliers that the gap had hidden.  effects: with the values of the last fit.
     """
-    yield from clean.remarks
+    yield from clean_data.remarks
     if not any(one.term.effect == SESSION_JUMP.name for one in effects):  # its size is the fit's
-        yield from clean.jump_texts
-    yield from filter(None, [study.scene.unused_torques])
-    if late:
-        yield f"outliers that no effect found explains: {name_first(late)}"
-    every = ladder.last.cell.placed(clean.measured)
-    yield from find_contradicting_points(every, ladder.last.cell.error(every))
-    yield from session_notices(study, effects)
+        yield from clean_data.jump_texts
+    yield from filter(None, [study.scene.unused_torques_notice])
+    if late_outliers:
+        yield f"outliers that no effect found explains: {format_first_names(late_outliers)}"
+    every = budget.last_fit.cell.align_to_first_session(clean_data.measured)
+    yield from find_contradicting_points(every, budget.last_fit.cell.error(every))
+    yield from describe_session_changes(study, effects)
     yield from study.fit.notices
 
 
-def judge_steps(
-    study: Study, judges: Judges, causes: Causes, ladder: Ladder, spoilt: Measurements | None
-) -> list[Step]:
+def judge_budget_steps(
+    study: LinearisedGeometry,
+    judging_poses: JudgingPoses,
+    causes: FoundCauses,
+    budget: BudgetSteps,
+    faulty_training_poses: Measurements | None,
+) -> list[BudgetStep]:
     """The steps of the budget, each judged: faults of the data first, by what they do to a fit.
 
-    spoilt: training poses as measured, where they hold faults that were mended.
+    faulty_training_poses: training poses as measured, where they hold faults that were mended.
     """
     robot, geometric = study.robot, "geometric"
-    steps = [judges.step("nominal", study.nominal)]
-    if spoilt:
-        fit, whole = fit_cell(robot, spoilt, SUM, silent), replace(judges, train=spoilt)
+    steps = [judging_poses.judge_cell("nominal", study.nominal_cell)]
+    if faulty_training_poses:
+        fit, whole = (
+            fit_cell(robot, faulty_training_poses, LEAST_SQUARES_OPTIONS, silent_progress),
+            replace(judging_poses, training_measurements=faulty_training_poses),
+        )
         steps = [
-            whole.step("nominal", fit.nominal_cell(robot, spoilt)),
-            whole.step("geometric", fit.cell(robot, spoilt)),
+            whole.judge_cell("nominal", fit.nominal_cell(robot, faulty_training_poses)),
+            whole.judge_cell("geometric", fit.cell(robot, faulty_training_poses)),
         ]
-        faults = dict.fromkeys(f.effect for f in causes.faults if f.effect in FAULTS)
+        faults = dict.fromkeys(f.effect for f in causes.faults if f.effect in MENDED_FAULT_NAMES)
         geometric = f"without {' and '.join(faults)}"
-    names = (geometric, *(causes.effects[number].term.step for number in ladder.taken))
-    cells = zip(names, ladder.fits, strict=True)
-    return [*steps, *(judges.step(name, fit.cell) for name, fit in cells)]
+    names = (
+        geometric,
+        *(causes.effects[number].term.budget_step_name for number in budget.taken_numbers),
+    )
+    cells = zip(names, budget.joint_fits, strict=True)
+    return [*steps, *(judging_poses.judge_cell(name, fit.cell) for name, fit in cells)]
 
 
-def explain_contradiction(robot: Robot, floor: Floor, last: Step) -> str:
+def describe_contradiction(robot: Robot, floor: NoiseFloor, last_step: BudgetStep) -> str:
     """Why the last rung contradicts the data; empty where it does not."""
-    certain = floor.certain and floor.source != DISTANCES  # which do not hold what the arm does
+    certain = floor.is_certain and floor.source != DISTANCES  # which do not hold what the arm does
     known = (floor.value, floor.source) if certain else None
-    scores = {"training": (last.train, last.train), "held-out": (last.holdout, last.trusted)}
+    scores = {
+        "training": (last_step.train, last_step.train),
+        "held-out": (last_step.holdout, last_step.trusted),
+    }
     return missed_rows(robot, FileEvidence(scores, floor=known))

@@ -4,27 +4,31 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from minimax_cal.diagnosing.causes import Causes, remaining_beside_maps, search_beside_maps
-from minimax_cal.diagnosing.error_maps import error_maps
-from minimax_cal.diagnosing.established import select_frequent
+from minimax_cal.diagnosing.budget_steps import BudgetSteps, fit_budget_steps
+from minimax_cal.diagnosing.cause_search import (
+    FoundCauses,
+    search_beside_maps,
+    with_remaining_beside_maps,
+)
+from minimax_cal.diagnosing.confirmation import select_frequent
+from minimax_cal.diagnosing.error_map_search import search_error_maps
 from minimax_cal.diagnosing.findings import merge_gear_lines, with_complete_law
-from minimax_cal.diagnosing.gap import Ladder, fit_ladder
-from minimax_cal.diagnosing.study import Study
+from minimax_cal.diagnosing.study import LinearisedGeometry
 from minimax_cal.fitting.options import Progress
 
 
 def fit_error_budget(
-    study: Study, causes: Causes, progress: Progress
-) -> tuple[Causes, Causes, Ladder]:
+    study: LinearisedGeometry, causes: FoundCauses, progress: Progress
+) -> tuple[FoundCauses, FoundCauses, BudgetSteps]:
     """The error budget of the causes, with the error maps that joints have besides.
 
     Returns the causes, the same as the budget tried them, and the steps that it took.
     """
 
-    def fit_steps(tried: Causes) -> Ladder:
+    def fit_steps(tried: FoundCauses) -> BudgetSteps:
         laws = [found.terms for found in tried.effects]
         confirmed = [found.established for found in tried.effects]
-        return fit_ladder(study, laws, confirmed, guessed=tried.guessed)
+        return fit_budget_steps(study, laws, confirmed, are_best_guesses=tried.is_best_guess)
 
     searched = causes
     for is_repeated in (False, True):
@@ -38,33 +42,37 @@ def fit_error_budget(
         # Error maps, and fine waves, that these steps lack; then the steps with them, and without
         # laws of the same angle that they replace.
         progress("error maps of joints")
-        maps = error_maps(ladder.last, tried.exclude)
+        maps = search_error_maps(ladder.last_fit, tried.exclude)
         if maps.terms:
-            taken = [tried.effects[number] for number in ladder.taken]
-            effects = merge_gear_lines(maps.findings(taken, study.scene))
-            tried = replace(tried, effects=tuple(effects), maps=maps)
-            tried = remaining_beside_maps(study, tried, maps.terms)
+            taken = [tried.effects[number] for number in ladder.taken_numbers]
+            effects = merge_gear_lines(maps.build_findings(taken, study.scene))
+            tried = replace(tried, effects=tuple(effects), joint_error_maps=maps)
+            tried = with_remaining_beside_maps(study, tried, maps.terms)
             ladder = fit_steps(tried)
-            texts = {term.text for term in ladder.last.terms}
+            texts = {term.text for term in ladder.last_fit.terms}
             held = [term for term in maps.terms if term.text in texts]
             if len(held) < len(maps.terms):
-                tried = remaining_beside_maps(study, tried, held)
+                tried = with_remaining_beside_maps(study, tried, held)
 
         # The search is repeated beside the maps: laws that stood in for a curve are found no more.
         # The second budget counts where groups held out are predicted no worse by it.
         if not is_repeated:
             best = tried, ladder
-            if not ladder.maps:
+            if not ladder.error_map_terms:
                 break
             progress("causes beside the error maps")
-            searched = search_beside_maps(study, causes, ladder.maps)
-        elif ladder.maps and predicts_no_worse(ladder, best[1]):
+            searched = search_beside_maps(study, causes, ladder.error_map_terms)
+        elif ladder.error_map_terms and predicts_no_worse(ladder, best[1]):
             best = tried, ladder
     tried, ladder = best
-    return tried if tried.maps.terms else causes, tried, ladder
+    return tried if tried.joint_error_maps.terms else causes, tried, ladder
 
 
-def predicts_no_worse(ladder: Ladder, other: Ladder) -> bool:
+def predicts_no_worse(budget: BudgetSteps, other_budget: BudgetSteps) -> bool:
     """Whether groups left out of the last fit are predicted no worse than by another's."""
-    parts = ladder.last.spared(other.last.spared(other.parts))
-    return ladder.last.cross_validated(parts) <= other.last.cross_validated(parts)
+    parts = budget.last_fit.select_dispensable_folds(
+        other_budget.last_fit.select_dispensable_folds(other_budget.fold_masks)
+    )
+    return budget.last_fit.cross_validate_folds(
+        parts
+    ) <= other_budget.last_fit.cross_validate_folds(parts)

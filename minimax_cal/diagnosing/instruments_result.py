@@ -6,45 +6,63 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any
 
-from minimax_cal.diagnosing.result import FOUND, Explained, Finding, Proposal, ends_of
-from minimax_cal.diagnosing.result import VERDICTS as VERDICTS  # in annotations that are inherited
-from minimax_cal.diagnosing.result import Untestable as Untestable
-from minimax_cal.diagnosing.sentences import explained
-from minimax_cal.evidence.limits import LEVEL
-from minimax_cal.fitting.opened import RELATIVE
-from minimax_cal.fitting.several.result import RelativeCalibration, Scores
-from minimax_cal.ground.facts import APART, Fact, derived, in_digits, in_file
-from minimax_cal.ground.files import number, plain
-from minimax_cal.ground.records import reading, stored
-from minimax_cal.ground.results import Result, merged
-from minimax_cal.ground.tables import Table, filled
-from minimax_cal.ground.units import for_people, in_files
-from minimax_cal.instruments.instrument import METRE
-from minimax_cal.modelling.effects.words import name_step
+from minimax_cal.core.files import float_from_json, to_plain_json
+from minimax_cal.core.record_fields import (
+    SEPARATE_FIELD_FORMAT,
+    FieldFormat,
+    derived_field,
+    record_to_file_values,
+    round_to_15_digits,
+)
+from minimax_cal.core.record_parsing import convert_read_errors, parse_record_fields
+from minimax_cal.core.results import Result, merge_nested_mappings
+from minimax_cal.core.tables import Table, drop_empty_tables
+from minimax_cal.core.units import display_unit_of_change, file_unit
+from minimax_cal.diagnosing.diagnosis import (
+    EFFECT_TABLE_COLUMNS,
+    Explanation,
+    Finding,
+    MeasurementProposal,
+    summarise_first_and_last_steps,
+)
+from minimax_cal.diagnosing.diagnosis import (
+    VERDICTS as VERDICTS,
+)  # in annotations that are inherited
+from minimax_cal.diagnosing.diagnosis_sentences import describe_explanation
+from minimax_cal.fitting.multi_instrument.relative_result import (
+    MeasuredAccuracy,
+    RelativeCalibration,
+)
+from minimax_cal.fitting.opened_results import RELATIVE_CALIBRATION_KIND
+from minimax_cal.instruments.instrument import METRE_UNIT
+from minimax_cal.modelling.effects.effect_names import format_budget_step
+from minimax_cal.selection.thresholds import FALSE_NAME_PROBABILITY
 from minimax_cal.solvers.status import Status as Status
 
-RIVALS = ("effect", "alternative", "similarity", "power", "fits worse by")
+SHOWN_ALTERNATIVE_COLUMNS = ("effect", "alternative", "similarity", "power", "fits worse by")
 
 
 @dataclass(frozen=True)
 class RelativeStep:
     """One step of the error budget.  holdout: of all files; files: held out, of each by name."""
 
-    name: Annotated[str, Fact(key="step")]
-    holdout: Scores
-    files: Mapping[str, Scores]
+    name: Annotated[str, FieldFormat(key="step")]
+    holdout: MeasuredAccuracy
+    files: Mapping[str, MeasuredAccuracy]
 
     @staticmethod
-    def of(name: str, found: RelativeCalibration, *, nominal: bool = False) -> RelativeStep:
+    def from_calibration(
+        name: str, calibration: RelativeCalibration, *, nominal: bool = False
+    ) -> RelativeStep:
         """Of a calibration, or of the drawn arm with its instruments fitted."""
         key = "nominal" if nominal else "holdout"
-        several = found.instruments if len(found.instruments) > 1 else ()
+        several = calibration.instruments if len(calibration.instruments) > 1 else ()
         files = {one.name: one.accuracy[key] for one in several}
-        return RelativeStep(name, found.accuracy[key], files)
+        return RelativeStep(name, calibration.accuracy[key], files)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class RelativeDiagnosis(Explained, Result):
+class RelativeDiagnosis(Explanation, Result):
     """What is still wrong with an arm that several instruments measured.
 
     calibration: with the effects that the budget took.  steps: nominal, geometric, then with each
@@ -52,23 +70,23 @@ class RelativeDiagnosis(Explained, Result):
     at least, and what noise and sound joints may add up to, in its unit [SI].
     """
 
-    KIND = RELATIVE
+    KIND = RELATIVE_CALIBRATION_KIND
     COMMAND = "relative"
 
-    calibration: Annotated[RelativeCalibration, APART]
-    steps: Annotated[tuple[RelativeStep, ...], Fact(key="gap.ladder", fewest=2)]
-    floor_file: Annotated[str, Fact(key="floor.file")]
-    floor: Annotated[tuple[float, float], APART]
-    floor_unit: Annotated[str, APART]
+    calibration: Annotated[RelativeCalibration, SEPARATE_FIELD_FORMAT]
+    steps: Annotated[tuple[RelativeStep, ...], FieldFormat(key="gap.ladder", fewest=2)]
+    floor_file: Annotated[str, FieldFormat(key="floor.file")]
+    floor: Annotated[tuple[float, float], SEPARATE_FIELD_FORMAT]
+    floor_unit: Annotated[str, SEPARATE_FIELD_FORMAT]
     seconds: float
 
     def __repr__(self) -> str:
         return f"<RelativeDiagnosis of {self.calibration.robot.name}: {self.verdict}>"
 
     @property
-    def excess(self) -> str:
+    def describe_excess(self) -> str:
         """What the last step leaves, against the noise that was given."""
-        scale, unit = for_people(self.floor_unit)
+        scale, unit = display_unit_of_change(self.floor_unit)
         spec = ".3f" if unit == "mm" else "#.3g"
         low, high = (f"{scale * size:{spec}} {unit}" for size in self.floor)
         where = f"{self.floor_file}: " if self.floor_file else ""
@@ -84,21 +102,21 @@ class RelativeDiagnosis(Explained, Result):
         """What the reader should know."""
         return self.calibration.notices
 
-    @derived()
+    @derived_field()
     def reasons(self) -> tuple[str, ...]:
         """The verdict and why, in sentences."""
-        return explained(self)
+        return describe_explanation(self)
 
-    @derived()
-    def next(self) -> Proposal | None:
+    @derived_field()
+    def next(self) -> MeasurementProposal | None:
         """The one measurement to make next; None where none is worth it."""
-        from minimax_cal.diagnosing.proposals import proposal
+        from minimax_cal.diagnosing.proposals import propose_next_measurement
 
-        return proposal(self, self.meets_floor is not None)
+        return propose_next_measurement(self, self.meets_floor is not None)
 
     def headline(self) -> str:
         """The verdict in words, and the held-out errors."""
-        first, last = (self.in_units(self.steps[i]) for i in (1, -1))
+        first, last = (self.split_step_by_unit(self.steps[i]) for i in (1, -1))
         texts = []
         for name, before in first.items():
             rms, _, _, unit = before.for_display
@@ -108,17 +126,17 @@ class RelativeDiagnosis(Explained, Result):
             texts.append(f"{name}{rms:{spec}} {unit}{fall}")
         return " ".join([*self.reasons, f"Held-out RMS error: geometry {', '.join(texts)}."])
 
-    def in_units(self, step: RelativeStep) -> dict[str, Scores]:
+    def split_step_by_unit(self, step: RelativeStep) -> dict[str, MeasuredAccuracy]:
         """Errors of a step, each in one unit: of all files, or of each by name."""
         if len(self.calibration.units) == 1:
             return {"": step.holdout}
         return {f"{name} ": scores for name, scores in step.files.items()}
 
-    def steps_table(self) -> Table:
+    def budget_table(self) -> Table:
         """The error budget, step by step, by file."""
         files, is_common = tuple(self.steps[0].files), len(self.calibration.units) == 1
         columns = ["model"]
-        rows: list[list[object]] = [[name_step(step.name)] for step in self.steps]
+        rows: list[list[object]] = [[format_budget_step(step.name)] for step in self.steps]
         every = [[step.holdout for step in self.steps]] if is_common else []
         every += [[step.files[name] for step in self.steps] for name in files]
         for name, scores in zip([""] * is_common + [f"{n} " for n in files], every, strict=True):
@@ -127,35 +145,40 @@ class RelativeDiagnosis(Explained, Result):
             columns += [f"{name}RMS {unit} {spec}"] + [f"max {unit} {spec}"] * (not name)
             for row, one in zip(rows, scores, strict=True):
                 row += one.for_display[: 1 if name else 2]
-        return Table.made("error budget, held-out poses", rows, *columns)
+        return Table.from_rows("error budget, held-out poses", rows, *columns)
 
     def effects_table(self) -> Table:
         """The effects found, with what each does for held-out poses."""
         rows = (
-            (f.name, f.cause, 100.0 * f.share, f.before, f.after, f.chance, f.evidence)
+            (f.name, f.cause, 100.0 * f.share, f.before, f.after, f.p_value_text, f.evidence)
             for f in self.effects
         )
-        title = f"effects found; p-values below {LEVEL:g} are significant"
-        return Table.made(title, rows, FOUND)
+        title = f"effects found; p-values below {FALSE_NAME_PROBABILITY:g} are significant"
+        return Table.from_rows(title, rows, EFFECT_TABLE_COLUMNS)
 
-    def own_tables(self) -> tuple[Table, ...]:
+    def diagnosis_tables(self) -> tuple[Table, ...]:
         """Those of the diagnosis."""
-        return filled(self.steps_table(), self.effects_table(), self.parameter_table(),
-                      self.rival_table().brief(*RIVALS), self.untestable_table())  # fmt: skip
+        return drop_empty_tables(
+            self.budget_table(),
+            self.effects_table(),
+            self.parameter_table(),
+            self.alternative_table().shorten(*SHOWN_ALTERNATIVE_COLUMNS),
+            self.untestable_table(),
+        )
 
     def first_tables(self) -> tuple[Table, ...]:
         """What stands on the first screen."""
         shown = ("effect", "share of error %", "before mm", "after mm", "evidence")
-        return filled(self.steps_table(), self.effects_table().brief(*shown))
+        return drop_empty_tables(self.budget_table(), self.effects_table().shorten(*shown))
 
     def tables(self) -> tuple[Table, ...]:
         """Every table, those of the calibration last."""
-        return (*self.own_tables(), *self.calibration.tables())
+        return (*self.diagnosis_tables(), *self.calibration.tables())
 
     def to_dict(self, *, poses: bool = True) -> dict[str, Any]:
         """The JSON of the calibration, with the key diagnosis, as `Diagnosis` where it means so."""
-        scale, unit = in_files(self.floor_unit)
-        remaining, highest = (in_digits(scale * size) for size in self.floor)
+        scale, unit = file_unit(self.floor_unit)
+        remaining, highest = (round_to_15_digits(scale * size) for size in self.floor)
         floor = {"remaining": remaining, "noise_floor": highest, "unit": unit}
         if unit == "mm":
             floor = {"remaining_mm": remaining, "noise_floor_mm": highest}
@@ -163,9 +186,12 @@ class RelativeDiagnosis(Explained, Result):
             "floor_known": self.meets_floor is not None,
             "floor": floor,
             "effects": self.effects,
-            "gap": {f"holdout_{kind}": ends for kind, ends in ends_of(self.steps).items()},
+            "gap": {
+                f"holdout_{kind}": ends
+                for kind, ends in summarise_first_and_last_steps(self.steps).items()
+            },
         }
-        own = merged(plain(in_file(self)), plain(more))
+        own = merge_nested_mappings(to_plain_json(record_to_file_values(self)), to_plain_json(more))
         return {**self.calibration.to_dict(), "diagnosis": own}
 
     @classmethod
@@ -173,16 +199,20 @@ class RelativeDiagnosis(Explained, Result):
         """From `to_dict`.  Raises CalibrationError."""
         calibration = RelativeCalibration.from_dict(content, source)
         terms = calibration.cell.effects.terms if calibration.cell else ()
-        with reading(source, "diagnosis"):
+        with convert_read_errors(source, "diagnosis"):
             own = content["diagnosis"]
-            told, floor = stored(cls, own), own["floor"]
+            told, floor = parse_record_fields(cls, own), own["floor"]
             end, scale = ("", 1.0) if "unit" in floor else ("_mm", 1e-3)
-            low, high = (scale * number(floor[f"{k}{end}"]) for k in ("remaining", "noise_floor"))
+            low, high = (
+                scale * float_from_json(floor[f"{k}{end}"]) for k in ("remaining", "noise_floor")
+            )
             each = enumerate(own["effects"])
             return cls(
                 **told,
                 calibration=calibration,
-                effects=tuple(Finding.told(one, f"effects[{i}]", terms) for i, one in each),
+                effects=tuple(
+                    Finding.parse_finding(one, f"effects[{i}]", terms) for i, one in each
+                ),
                 floor=(low, high),
-                floor_unit=str(floor.get("unit", METRE)),
+                floor_unit=str(floor.get("unit", METRE_UNIT)),
             )

@@ -10,23 +10,23 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from minimax_cal.dynamics.laws import USUAL, WORDS
-from minimax_cal.dynamics.model import TorqueModel
-from minimax_cal.dynamics.probes import Unexplained
-from minimax_cal.dynamics.regressor import PER_LINK
-from minimax_cal.dynamics.rows import YIELD, Arm
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.facts import APART, Fact
-from minimax_cal.ground.records import stored
-from minimax_cal.ground.results import Result
-from minimax_cal.ground.tables import Table, filled
-from minimax_cal.measuring.faults.fault import Amount
-from minimax_cal.modelling.effects.words import name_place
+from minimax_cal.core.arrays import Array
+from minimax_cal.core.record_fields import SEPARATE_FIELD_FORMAT, FieldFormat
+from minimax_cal.core.record_parsing import parse_record_fields
+from minimax_cal.core.results import Result
+from minimax_cal.core.tables import Table, drop_empty_tables
+from minimax_cal.dynamics.laws import TORQUE_EFFECT_WORDS, USUAL_FRICTION_EFFECTS
+from minimax_cal.dynamics.regressor import INERTIAL_PARAMETERS_PER_LINK
+from minimax_cal.dynamics.residual_structure import Unexplained
+from minimax_cal.dynamics.torque_regression import TorqueModel
+from minimax_cal.dynamics.torque_rows import BRISTLE_YIELD_DISTANCES, TorqueArm
+from minimax_cal.measuring.faults.data_fault import FaultAmount
+from minimax_cal.modelling.effects.effect_names import format_place
 from minimax_cal.robots.robot import robot_from_dict
 
-Verdict = Literal["named", "one_of", "unknown", "none"]
-SHOWN = 1e-3  # relative change of a joint's RMS that is listed
-SENTENCES: dict[Verdict, str] = {
+MotionVerdict = Literal["named", "one_of", "unknown", "none"]
+MIN_LISTED_RELATIVE_RMS_CHANGE = 1e-3  # relative change of a joint's RMS that is listed
+MOTION_VERDICT_SENTENCES: dict[MotionVerdict, str] = {
     "named": "Cause identified",
     "one_of": "Ambiguous cause",
     "unknown": "Unexplained",
@@ -35,7 +35,7 @@ SENTENCES: dict[Verdict, str] = {
 
 
 @dataclass(frozen=True)
-class Alternative:
+class MotionAlternative:
     """Another effect that explains the same.  rho2: similarity.  separate_with: what would tell."""
 
     effect: str
@@ -55,35 +55,41 @@ class MotionEffect:
 
     effect: str
     place: str
-    parameters: Annotated[tuple[Amount, ...], Fact(fewest=1)]
+    parameters: Annotated[tuple[FaultAmount, ...], FieldFormat(fewest=1)]
     worth: Mapping[str, tuple[float, float]]
-    alternatives: tuple[Alternative, ...] = ()
+    alternatives: tuple[MotionAlternative, ...] = ()
     frequency: float = math.nan
     established: bool = True
     minor: bool = False
     family: str = ""
 
     @property
-    def best(self) -> tuple[str, tuple[float, float]]:
+    def joint_of_largest_gain(self) -> tuple[str, tuple[float, float]]:
         """The joint at which it closes most, and the RMS without and with it."""
         return max(self.worth.items(), key=lambda item: item[1][0] ** 2 - item[1][1] ** 2)
 
     @property
     def relative_gain(self) -> float:
         """Fall of the squared RMS at the joint at which it closes most, over the square before."""
-        before, after = self.best[1]
+        before, after = self.joint_of_largest_gain[1]
         return (before**2 - after**2) / max(before**2, 1e-300)
 
     @property
     def words(self) -> str:
         """For people, as `joint flexibility at J2`; of a payload with the runs that carry it."""
-        runs = ", ".join(p.name for p in self.parameters[PER_LINK:] if self.effect == "payload")
-        return f"{WORDS[self.effect]} {name_place(self.place)}" + (f" ({runs})" if runs else "")
+        runs = ", ".join(
+            p.name
+            for p in self.parameters[INERTIAL_PARAMETERS_PER_LINK:]
+            if self.effect == "payload"
+        )
+        return f"{TORQUE_EFFECT_WORDS[self.effect]} {format_place(self.place)}" + (
+            f" ({runs})" if runs else ""
+        )
 
-    def row(self) -> tuple[str, ...]:
+    def build_table_row(self) -> tuple[str, ...]:
         """Of a table: words, the surest number, the worth where it is most, and whether it is."""
         p = max(self.parameters, key=lambda each: abs(each.value) / (each.sigma or 1.0))
-        joint, (before, after) = self.best
+        joint, (before, after) = self.joint_of_largest_gain
         return (self.words, f"{p.value:.3g} ± {p.sigma:.1g} {p.unit}",
                 f"{joint}: {before:.3g} to {after:.3g}",
                 "yes" if self.established else "possible")  # fmt: skip
@@ -99,7 +105,7 @@ class MotionStep:
 
 
 @dataclass(frozen=True)
-class NotTestable:
+class UntestableMotionEffect:
     """An effect that the logs cannot show, and the run that would."""
 
     effect: str
@@ -108,7 +114,7 @@ class NotTestable:
 
 
 @dataclass(frozen=True, eq=False)
-class HeldRun:
+class HeldOutRun:
     """A stretch of a run, measured and predicted by a fit without it: times and (n, k) torques."""
 
     name: str
@@ -138,18 +144,18 @@ class MotionDiagnosis(Result):
 
     KIND = "motion_diagnosis"
     COMMAND = "torques"
-    arm: Annotated[Arm, APART]
+    arm: Annotated[TorqueArm, SEPARATE_FIELD_FORMAT]
     unit: str
-    verdict: Verdict
+    verdict: MotionVerdict
     effects: tuple[MotionEffect, ...]
-    budget: Annotated[tuple[MotionStep, ...], Fact(fewest=1)]
+    budget: Annotated[tuple[MotionStep, ...], FieldFormat(fewest=1)]
     unexplained: tuple[Unexplained, ...]
-    not_testable: tuple[NotTestable, ...]
-    too_little: Annotated[tuple[str, ...], Fact(key="too_little_motion")]
-    models: Annotated[tuple[TorqueModel, ...], Fact(fewest=1)]
+    not_testable: tuple[UntestableMotionEffect, ...]
+    too_little: Annotated[tuple[str, ...], FieldFormat(key="too_little_motion")]
+    models: Annotated[tuple[TorqueModel, ...], FieldFormat(fewest=1)]
     runs: tuple[str, ...]
     held_out: str
-    held_run: HeldRun
+    held_run: HeldOutRun
     curves: tuple[FrictionCurve, ...]
     notices: tuple[str, ...]
     seconds: float
@@ -166,15 +172,17 @@ class MotionDiagnosis(Result):
         """The verdict in a sentence or two."""
         if self.too_little:
             return f"Too little motion to name a cause: {self.too_little[0]}."
-        said = SENTENCES[self.verdict]
+        said = MOTION_VERDICT_SENTENCES[self.verdict]
         if self.main:
             places: dict[str, set[str]] = {}
-            for one in sorted(self.main, key=lambda one: one.effect in USUAL):  # those come last
-                places.setdefault(WORDS[one.effect], set()).add(one.place)
+            for one in sorted(
+                self.main, key=lambda one: one.effect in USUAL_FRICTION_EFFECTS
+            ):  # those come last
+                places.setdefault(TORQUE_EFFECT_WORDS[one.effect], set()).add(one.place)
             named = (f"{words} at {', '.join(sorted(some))}" for words, some in places.items())
             said += f": {'; '.join(named)}"
         if self.unexplained and self.verdict in ("named", "unknown"):
-            said += f". {self.unexplained[0].sentence(self.unit)}"
+            said += f". {self.unexplained[0].describe_structure(self.unit)}"
         return f"{said}."
 
     def sentences(self) -> tuple[str, ...]:
@@ -190,82 +198,100 @@ class MotionDiagnosis(Result):
 
     def tables(self) -> tuple[Table, ...]:
         """Every table of the result."""
-        return filled(self.budget_table(), self.effects_table(), self.unexplained_table())
+        return drop_empty_tables(
+            self.budget_table(), self.effects_table(), self.unexplained_table()
+        )
 
     def budget_table(self, which: str = "all", of: str = "holdout_rms") -> Table:
         """The error budget: held-out RMS of each joint, step by step.  which: rows, of: those."""
         title = f"Held-out RMS torque [{self.unit}], {which} rows ({self.held_out})"
-        return table_by_joint(title, "step", self.budget, of)
+        return build_table_by_joint(title, "step", self.budget, of)
 
     def effects_table(self) -> Table:
         """The effects, the most valuable first."""
-        rows = (one.row() for one in self.effects)
+        rows = (one.build_table_row() for one in self.effects)
         worth = f"held-out RMS, moving [{self.unit}]"
-        return Table.made("Effects", rows, "effect | value", worth, "confirmed")
+        return Table.from_rows("Effects", rows, "effect | value", worth, "confirmed")
 
     def unexplained_table(self) -> Table:
         """What has no name, by joint."""
-        return Table.of("Unexplained", self.unexplained, "place=joint | follows",
+        return Table.from_records("Unexplained", self.unexplained, "place=joint | follows",
                         f"size=size [{self.unit}] .3g",
                         f"noise=remaining error [{self.unit}] .3g")  # fmt: skip
 
-    def beside(self, *, poses: bool = True) -> dict[str, Any]:
+    def extra_file_content(self, *, with_measurements: bool = True) -> dict[str, Any]:
         """The headline, and the arm with its robot for itself."""
         return {"headline": self.headline(), "robot": self.arm.robot, "arm": self.arm}
 
     @classmethod
-    def told_beside(
-        cls, content: Mapping[str, Any], told: Mapping[str, Any], source: str
+    def parse_extra_fields(
+        cls, content: Mapping[str, Any], parsed_fields: Mapping[str, Any], source: str
     ) -> dict[str, Any]:
         """The arm.  Raises CalibrationError and ValueError, also for parts of another arm."""
         robot = robot_from_dict(content["robot"], source)
-        arm = Arm(robot, **stored(Arm, content["arm"], "arm"))
-        check_parts(cls(**told, arm=arm))
+        arm = TorqueArm(robot, **parse_record_fields(TorqueArm, content["arm"], "arm"))
+        check_diagnosis_is_of_one_arm(cls(**parsed_fields, arm=arm))
         return {"arm": arm}
 
 
-def table_by_joint(title: str, what: str, records: Sequence[object], of: str) -> Table:
-    """A number of each joint, a row a record.  what: their names are; of: the attribute."""
-    joints = range(len(getattr(records[0], of)))
-    return Table.of(title, records, f"name={what}", *(f"{of}.{j}=J{j + 1} .3g" for j in joints))
+def build_table_by_joint(
+    title: str, name_heading: str, records: Sequence[object], attribute: str
+) -> Table:
+    """A number of each joint, a row a record.  name_heading: their names are; attribute: the
+    attribute.
+    """
+    joints = range(len(getattr(records[0], attribute)))
+    return Table.from_records(
+        title, records, f"name={name_heading}", *(f"{attribute}.{j}=J{j + 1} .3g" for j in joints)
+    )
 
 
-def worth_by_joint(without: Array, with_it: Array) -> dict[str, tuple[float, float]]:
+def pair_rms_by_joint(rms_without: Array, rms_with: Array) -> dict[str, tuple[float, float]]:
     """RMS without and with something (n,) each, by joint."""
-    pairs = np.stack([without, with_it], axis=1).tolist()
+    pairs = np.stack([rms_without, rms_with], axis=1).tolist()
     return {f"J{j + 1}": (before, after) for j, (before, after) in enumerate(pairs)}
 
 
-def changed_joints(without: Array, with_it: Array) -> dict[str, tuple[float, float]]:
-    """`worth_by_joint` of the joints that something changes by a thousandth or more."""
-    worth = worth_by_joint(without, with_it).items()
-    return {joint: (a, b) for joint, (a, b) in worth if abs(a - b) > SHOWN * a}
+def pair_changed_rms_by_joint(
+    rms_without: Array, rms_with: Array
+) -> dict[str, tuple[float, float]]:
+    """`pair_rms_by_joint` of the joints that something changes by a thousandth or more."""
+    worth = pair_rms_by_joint(rms_without, rms_with).items()
+    return {
+        joint: (a, b) for joint, (a, b) in worth if abs(a - b) > MIN_LISTED_RELATIVE_RMS_CHANGE * a
+    }
 
 
-def check_parts(found: MotionDiagnosis) -> None:
+def check_diagnosis_is_of_one_arm(diagnosis: MotionDiagnosis) -> None:
     """Raise ValueError for parts that are not of one arm, and for effects that do not exist."""
-    arm, run, n = found.arm, found.held_run, found.arm.robot.joints
+    arm, run, n = diagnosis.arm, diagnosis.held_run, diagnosis.arm.robot.joints
     sizes: list[tuple[Any, tuple[int, ...]]] = [
-        *((row, (n,)) for row in (arm.ratio, arm.soft, arm.fastest, found.curves)),
-        *((row, (n,)) for s in found.budget for row in (s.holdout_rms, s.holdout_rms_moving)),
-        (arm.gain, (n if arm.shared else 0,)), (arm.known, (PER_LINK,)),
+        *((row, (n,)) for row in (arm.ratio, arm.soft, arm.fastest, diagnosis.curves)),
+        *((row, (n,)) for s in diagnosis.budget for row in (s.holdout_rms, s.holdout_rms_moving)),
+        (arm.gain, (n if arm.has_shared_inertial_parameters else 0,)),
+        (arm.known, (INERTIAL_PARAMETERS_PER_LINK,)),
         *((part, (n, len(run.time))) for part in (run.measured, run.predicted)),
-        *((p, (len(c.speed),)) for c in found.curves for p in (c.speed, c.torque, c.sigma)),
-    ]  # fmt: skip
-    for model in found.models:
-        sizes.append((model.held, (n, len(YIELD))))
+        *((p, (len(c.speed),)) for c in diagnosis.curves for p in (c.speed, c.torque, c.sigma)),
+    ]
+    for model in diagnosis.models:
+        sizes.append((model.held, (n, len(BRISTLE_YIELD_DISTANCES))))
         for body in (model.body, model.context):
             joints = 1 if len(body.rigid) == 1 else n
-            sizes += [(body.usual, (n, 2)), (body.rigid, (joints, PER_LINK * n))]
-    late = [model.delay for model in found.models]
+            sizes += [
+                (body.usual, (n, 2)),
+                (body.rigid, (joints, INERTIAL_PARAMETERS_PER_LINK * n)),
+            ]
+    late = [model.delay for model in diagnosis.models]
     if any(np.shape(part) != size for part, size in sizes) or not np.isfinite(late).all():
         raise ValueError(f"its numbers are not of one arm of {n} joints and one run")
-    if not all(one.worth for one in found.effects):
+    if not all(one.worth for one in diagnosis.effects):
         raise ValueError("effects: one has no worth")
-    names = [one.effect for one in found.effects] + [one.effect for one in found.not_testable]
-    names += [other.effect for one in found.effects for other in one.alternatives]
+    names = [one.effect for one in diagnosis.effects] + [
+        one.effect for one in diagnosis.not_testable
+    ]
+    names += [other.effect for one in diagnosis.effects for other in one.alternatives]
     for name in names:
-        if name not in WORDS:
+        if name not in TORQUE_EFFECT_WORDS:
             raise ValueError(f"no effect {name!r:.40}")
 
 

@@ -12,11 +12,24 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
-from minimax_cal.fitting.checks import check_plausible, coarse_joints
+from minimax_cal.core.arrays import Array
+from minimax_cal.core.errors import CalibrationError, CalibrationWarning
+from minimax_cal.core.option_fields import take_option_fields_as_keywords
+from minimax_cal.core.threads import limit_blas_to_one_thread
+from minimax_cal.fitting.cell_fit import fit_cell
+from minimax_cal.fitting.data_slips import check_plausible, warn_of_coarse_joints
 from minimax_cal.fitting.fit import Fit
-from minimax_cal.fitting.floor import with_instrument
+from minimax_cal.fitting.fit_judgement import DataSplit, judge_fit
 from minimax_cal.fitting.geometry_fit import MIN_TARGET_POSES
-from minimax_cal.fitting.judged import DataSplit, judge_fit
+from minimax_cal.fitting.multi_instrument.options import (
+    RELATIVE_OPTION_READERS,
+    RelativeOptions,
+    check_no_instrument_options,
+    list_other_instrument_options,
+    merge_instrument_options,
+)
+from minimax_cal.fitting.multi_instrument.relative_result import RelativeCalibration
+from minimax_cal.fitting.noise_floor import with_u95_of_instrument
 from minimax_cal.fitting.options import (
     Loss,
     Objective,
@@ -24,43 +37,42 @@ from minimax_cal.fitting.options import (
     Progress,
     QpChoice,
     check_options,
-    objective_of,
-    silent,
-    usable,
+    parse_objective_target,
+    select_usable_qp_backend,
+    silent_progress,
 )
-from minimax_cal.fitting.several.options import (
-    READ,
-    RelativeOptions,
-    check_no_others,
-    only_others,
-    with_others,
-)
-from minimax_cal.fitting.several.result import RelativeCalibration
-from minimax_cal.fitting.solve import fit_cell
-from minimax_cal.fitting.stations import place_sessions, warn_of_unplaced_sessions
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import CalibrationError, CalibrationWarning
-from minimax_cal.ground.options import takes
-from minimax_cal.ground.threads import one_thread
-from minimax_cal.instruments import file
-from minimax_cal.instruments.file import InstrumentData, JointsAndPoints, PointData, taken
+from minimax_cal.fitting.session_frames import place_sessions, warn_of_unplaced_sessions
+from minimax_cal.instruments import instrument_files
 from minimax_cal.instruments.instrument import Instrument
-from minimax_cal.measuring import checks
-from minimax_cal.measuring.faults import distance_faults
-from minimax_cal.measuring.faults.points import noise
-from minimax_cal.measuring.faults.sessions import jumps as find_jumps
-from minimax_cal.measuring.grouping import groups, mislabelled, split, with_groups
-from minimax_cal.measuring.history import time_notices, with_history
-from minimax_cal.measuring.measurements import TOOL, Measurements, measurements
-from minimax_cal.measuring.set_aside import set_aside
-from minimax_cal.measuring.stations import seen_from
+from minimax_cal.instruments.instrument_files import (
+    InstrumentData,
+    JointsAndPoints,
+    PointData,
+    read_instruments_or_measurements,
+)
+from minimax_cal.measuring import measurement_checks
+from minimax_cal.measuring.faults import find_faults_by_distances
+from minimax_cal.measuring.faults.point_faults import find_misdeclared_noise
+from minimax_cal.measuring.faults.session_faults import locate_frame_jumps as find_jumps
+from minimax_cal.measuring.measurements import SET_ASIDE_BY_TOOL, Measurements, measurements
+from minimax_cal.measuring.pose_groups import (
+    add_group_column,
+    describe_mislabelled_pose,
+    group_repeated_poses,
+    split_train_and_holdout,
+)
+from minimax_cal.measuring.session_frames import convert_to_first_frame
+from minimax_cal.measuring.set_aside_points import set_points_aside
+from minimax_cal.measuring.visit_history import add_history_columns, list_time_notices
 from minimax_cal.modelling.effects.table import Term
-from minimax_cal.modelling.effects.time import SESSION_JUMP
-from minimax_cal.modelling.start import EVERYWHERE
+from minimax_cal.modelling.effects.time_effects import SESSION_JUMP
+from minimax_cal.modelling.global_start import NO_BASE_ROTATION
 from minimax_cal.robots.robot import Robot, RobotSource, load_robot
 
-JUMP = (SESSION_JUMP.name, f"{SESSION_JUMP.name}:frame")  # without its moment
-Given = file.Given | Sequence[file.Given] | JointsAndPoints
+JUMP_WITHOUT_TIME_TEXTS = (SESSION_JUMP.name, f"{SESSION_JUMP.name}:frame")  # without its moment
+CalibrationData = (
+    instrument_files.InstrumentInput | Sequence[instrument_files.InstrumentInput] | JointsAndPoints
+)
 
 
 @overload
@@ -71,7 +83,7 @@ def calibrate(
     qp: QpChoice = "daqp",
     *,
     loss: Loss = "square",
-    progress: Progress = silent,
+    progress: Progress = silent_progress,
     **options: Any,
 ) -> Fit: ...
 @overload
@@ -82,30 +94,34 @@ def calibrate(
     qp: QpChoice = "daqp",
     *,
     loss: Loss = "square",
-    progress: Progress = silent,
+    progress: Progress = silent_progress,
     **options: Any,
 ) -> RelativeCalibration: ...
 @overload
 def calibrate(
     robot: RobotSource,
-    data: Given,
+    data: CalibrationData,
     objective: Objective = "minimax",
     qp: QpChoice = "daqp",
     *,
     loss: Loss = "square",
-    progress: Progress = silent,
+    progress: Progress = silent_progress,
     **options: Any,
 ) -> Fit | RelativeCalibration: ...
-@takes(
-    "objective", "qp", options=Options, others=(RelativeOptions, only_others(Options)), read=READ
+@take_option_fields_as_keywords(
+    "objective",
+    "qp",
+    options=Options,
+    others=(RelativeOptions, list_other_instrument_options(Options)),
+    readers_by_field=RELATIVE_OPTION_READERS,
 )
 def calibrate(
     robot: Robot | str | Path,
-    data: Given,
+    data: CalibrationData,
     *,
     options: Options,
     others: RelativeOptions,
-    progress: Progress = silent,
+    progress: Progress = silent_progress,
 ) -> Fit | RelativeCalibration:
     """Calibrate a robot from measurements of any instruments.
 
@@ -141,18 +157,20 @@ def calibrate(
     if isinstance(data, tuple) and data and isinstance(data[0], np.ndarray | list | tuple):
         given = measurements(*(np.asarray(part, dtype=float) for part in data))
     else:
-        given = taken(data)  # type: ignore[arg-type]
+        given = read_instruments_or_measurements(data)  # type: ignore[arg-type]
     if isinstance(given, Measurements):
-        check_no_others(given, others)
-        return calibrate_with(robot, given, options, progress)
-    from minimax_cal.fitting.several.kinds import relative_with  # slow to import
+        check_no_instrument_options(given, others)
+        return calibrate_tracker_points(robot, given, options, progress)
+    from minimax_cal.fitting.multi_instrument.relative_calibration import (
+        calibrate_instruments,
+    )  # slow to import
 
-    asked = with_others(given, options, others)
-    return relative_with(robot, given, asked, progress)
+    asked = merge_instrument_options(given, options, others)
+    return calibrate_instruments(robot, given, asked, progress)
 
 
-@one_thread()
-def calibrate_with(
+@limit_blas_to_one_thread()
+def calibrate_tracker_points(
     robot: Robot | str | Path, data: Measurements, options: Options, progress: Progress
 ) -> Fit:
     """`calibrate` of points of trackers, with its options in one."""
@@ -169,25 +187,29 @@ def calibrate_with(
     return judged.fit
 
 
-def again(fit: Fit, progress: Progress = silent, **changes: object) -> Fit:
+def refit_with_options(fit: Fit, progress: Progress = silent_progress, **changes: object) -> Fit:
     """A fit of the same poses, split as they were, with some options changed.
 
     changes: fields of `Options`.  Raises CalibrationError.
     """
     options = replace(fit.options, **changes)  # type: ignore[arg-type]
-    return fit_split(fit.nominal.robot, fit.data, fit.held, options, progress)
+    return fit_held_split(fit.nominal.robot, fit.data, fit.held, options, progress)
 
 
-def fit_split(
-    robot: Robot, data: Measurements, held: Array, options: Options, progress: Progress = silent
+def fit_held_split(
+    robot: Robot,
+    data: Measurements,
+    is_held: Array,
+    options: Options,
+    progress: Progress = silent_progress,
 ) -> Fit:
     """A fit of poses that are split already, as a result holds them.
 
-    held: (m,) True where held out.  Raises CalibrationError.
+    is_held: (m,) True where held out.  Raises CalibrationError.
     """
     began = time.perf_counter()
     data = check_input(robot, data, options)
-    parts = DataSplit(data, data.take(~held), data.take(held), data.notices)
+    parts = DataSplit(data, data.take(~is_held), data.take(is_held), data.notices)
     solved = fit_cell(robot, parts.train, options, progress)
     return judge_fit(robot, options, parts, solved, began).fit
 
@@ -197,12 +219,12 @@ def check_input(robot: Robot, data: Measurements, options: Options) -> Measureme
 
     Raises CalibrationError, before any work, for options and data that cannot be.
     """
-    objective_of(options.objective, data)
+    parse_objective_target(options.objective, data)
     check_options(options)
     if isinstance(options.qp, str):
-        usable(options.qp)
-    data = checks.check_joints(robot, data)
-    checks.check_spread(robot, data)
+        select_usable_qp_backend(options.qp)
+    data = measurement_checks.check_and_complete_joints(robot, data)
+    measurement_checks.check_point_spread(robot, data)
     return data
 
 
@@ -213,22 +235,33 @@ def split_data(robot: Robot, data: Measurements, options: Options) -> DataSplit:
     """
     # What a pose has of others, while all are there: its predecessor, repeats of it.
     if options.effects:
-        data = with_history(data)
-    data = with_groups(with_instrument(data, options.instrument))
+        data = add_history_columns(data)
+    data = add_group_column(with_u95_of_instrument(data, options.instrument))
     data = replace(data, simulated=data.simulated or options.simulated)
 
     # Poses that belong together are held out together.
-    train, held, split_notices = split(data, options.holdout, options.seed, options.holdout_by)
+    train, held, split_notices = split_train_and_holdout(
+        data, options.holdout, options.seed, options.holdout_by
+    )
     in_train = np.isin(data.line, train.line)
 
     # The points of all sessions in the frame of the first, which training poses alone determine.
     split_notices = (*split_notices, *warn_of_unplaced_sessions(data, in_train))
     data = place_sessions(robot, data, in_train)
-    train, held = seen_from(train, data.frames), seen_from(held, data.frames)
+    train, held = (
+        convert_to_first_frame(train, data.frames),
+        convert_to_first_frame(held, data.frames),
+    )
 
     # Faults that show without a fit: of joints, clocks and names, distances, noise.
-    doubts = (*checks.arm_notices(robot, data), *time_notices(data), mislabelled(data))
-    faults = tuple(fault.text for fault in (*distance_faults(data), *noise(data)))
+    doubts = (
+        *measurement_checks.list_robot_notices(robot, data),
+        *list_time_notices(data),
+        describe_mislabelled_pose(data),
+    )
+    faults = tuple(
+        fault.text for fault in (*find_faults_by_distances(data), *find_misdeclared_noise(data))
+    )
     notices = (*data.notices, *filter(None, doubts), *faults, *split_notices)
 
     # Targets that hardly any training pose shows are left out.
@@ -237,16 +270,18 @@ def split_data(robot: Robot, data: Measurements, options: Options) -> DataSplit:
         names = ", ".join(np.array(data.target_names)[few])
         why = f"fewer than {MIN_TARGET_POSES} poses"
         notices += (f"left out: {names}, measured at {why.replace('poses', 'training poses')}",)
-        data = set_aside(data, data.seen & few, f"the fit has {why} with this target", TOOL)
+        data = set_points_aside(
+            data, data.seen & few, f"the fit has {why} with this target", SET_ASIDE_BY_TOOL
+        )
         data, train, held = (part.keep(~few) for part in (data, train, held))
-        objective_of(options.objective, data)
+        parse_objective_target(options.objective, data)
 
     # Slips that show once base and targets are fitted; that base is where the fit begins.
-    near = EVERYWHERE
-    if len(np.unique(groups(train))) >= MIN_TARGET_POSES:
+    near = NO_BASE_ROTATION
+    if len(np.unique(group_repeated_poses(train))) >= MIN_TARGET_POSES:
         base = check_plausible(robot, data)
         near = base.state.rotation
-        notices += tuple(filter(None, [coarse_joints(robot, data, base)]))
+        notices += tuple(filter(None, [warn_of_coarse_joints(robot, data, base)]))
     return DataSplit(data, train, held, notices, near)
 
 
@@ -256,27 +291,29 @@ def with_jump_time(robot: Robot, parts: DataSplit, options: Options, progress: P
     That of the largest in the errors of the geometry, on all poses: held-out ones between the last
     training pose before it and the first one after could not be placed otherwise.
     """
-    if not any(text in JUMP for text in options.effects):
+    if not any(text in JUMP_WITHOUT_TIME_TEXTS for text in options.effects):
         return options
     geometric = replace(options, effects=(), objective="sum")
     cell = fit_cell(robot, parts.train, geometric, progress).cell(robot, parts.data)
-    rows, sizes = find_jumps(cell.placed(parts.data), cell.error(parts.data))
+    rows, sizes = find_jumps(cell.align_to_first_session(parts.data), cell.error(parts.data))
     if not len(rows):
         return options
     since = float(parts.data.columns["clock"][rows[np.argmax(sizes)]])
     jump = Term(SESSION_JUMP.name, "frame", {"since": since})
-    return replace(options, effects=[jump if e in JUMP else e for e in options.effects])
+    return replace(
+        options, effects=[jump if e in JUMP_WITHOUT_TIME_TEXTS else e for e in options.effects]
+    )
 
 
 # ---- many at once --------------------------------------------------------------------------------
 
 
-Data = Measurements | str | Path | tuple[ArrayLike, ArrayLike]
+SingleCampaignData = Measurements | str | Path | tuple[ArrayLike, ArrayLike]
 
 
 def calibrate_many(
     robots: Robot | str | Path | Sequence[Robot | str | Path],
-    data: Sequence[Data],
+    data: Sequence[SingleCampaignData],
     *,
     jobs: int = -1,
     cluster: str = "",
@@ -311,19 +348,19 @@ def calibrate_many(
     --------
     >>> fits = mc.calibrate_many("irb120", ["monday.csv", "friday.csv"], objective="sum")
     """
-    return do_many(calibrate, robots, data, jobs, cluster, options)
+    return run_for_many_arms(calibrate, robots, data, jobs, cluster, options)
 
 
-def do_many(
+def run_for_many_arms(
     verb: Callable[..., Any],
     robots: Robot | str | Path | Sequence[Robot | str | Path],
-    data: Sequence[Data],
+    data: Sequence[SingleCampaignData],
     jobs: int,
     cluster: str,
     options: dict[str, Any],
 ) -> tuple[Any, ...]:
     """What a verb makes of each robot and its data, or the error that says why it makes nothing."""
-    from minimax_cal.ground.parallel import share  # slow to import
+    from minimax_cal.core.parallel import run_in_parallel  # slow to import
 
     arms = [robots] * len(data) if isinstance(robots, Robot | str | Path) else list(robots)
     if len(arms) != len(data):
@@ -334,11 +371,21 @@ def do_many(
             known[str(arm)] = load_robot(arm)
     loaded = [arm if isinstance(arm, Robot) else known[str(arm)] for arm in arms]
     calls = [(verb, arm, sheet, options) for arm, sheet in zip(loaded, data, strict=True)]
-    found = dict(share(one, calls, [verb.__module__], processes=jobs, cluster=cluster))
+    found = dict(
+        run_in_parallel(
+            run_or_return_error,
+            calls,
+            [verb.__module__],
+            process_count=jobs,
+            scheduler_address=cluster,
+        )
+    )
     return tuple(found[number] for number in range(len(calls)))
 
 
-def one(verb: Callable[..., Any], robot: Robot, data: Data, options: dict[str, Any]) -> Any:
+def run_or_return_error(
+    verb: Callable[..., Any], robot: Robot, data: SingleCampaignData, options: dict[str, Any]
+) -> Any:
     """What a verb makes of one, or the error that says why it makes nothing."""
     try:
         return verb(robot, data, **options)

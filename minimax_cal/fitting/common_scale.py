@@ -15,66 +15,75 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import stdtr
 
-from minimax_cal.evidence.noise import fit_components
-from minimax_cal.ground.arrays import Array
+from minimax_cal.core.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.modelling.model import Model, model_of
-from minimax_cal.modelling.near import nearby
-from minimax_cal.modelling.parameters import State, links_of, zero_positions
-from minimax_cal.modelling.rows import by_pose
+from minimax_cal.modelling.error_rows import lack_of_fit_motions_by_pose
+from minimax_cal.modelling.nearby_fit import fit_nearby
+from minimax_cal.modelling.parameters import (
+    ParameterValues,
+    flatten_link_parameters,
+    joint_zero_indices,
+)
+from minimax_cal.modelling.point_model import PointModel, build_point_model
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.robot import Robot
+from minimax_cal.selection.noise_model import fit_variance_components
 
 OFF_LENGTH, OFF_ANGLE = 0.3e-3, 0.5e-3  # how well arms are drawn; times FACTORS [m, rad]
-LEAST_SHARE = 7e-4  # a smaller common factor may be the warmth of the arm: aluminium by 30 K
-FACTORS = np.geomspace(0.1, 30.0, 26)  # of the links' errors
-NOISES = np.geomspace(2e-6, 2e-2, 30)  # of a coordinate, with what no link explains [m]
-POSES = 60  # that tell a scale
+MIN_SCALE_ERROR = 7e-4  # a smaller common factor may be the warmth of the arm: aluminium by 30 K
+LINK_VARIANCE_FACTORS = np.geomspace(0.1, 30.0, 26)  # of the links' errors
+TRIAL_NOISES = np.geomspace(2e-6, 2e-2, 30)  # of a coordinate, with what no link explains [m]
+MAX_SCALE_POSES = 60  # that tell a scale
 LEAST_LENGTH, FEWEST = 0.05, 4  # of lengths that tell a common share: size [m]; their number
 # that lengths which are off at random agree so well on a share
 MAX_P_VALUE, MAX_DOUBTFUL_P_VALUE = 0.003, 0.05
 # sigmas of what the angles let expect, beside which doubtful agreement is enough
 MIN_CLEAR_SIGMAS = 3.0
-PARTS = np.linspace(0.0, 1.0, 33)  # of the range in which lengths are off at random,
-ROUNDS = 12  # cut again in each round
-MEDIAN = 0.6745  # of a Gaussian's absolute value, in sigmas
+NUISANCE_FRACTIONS = np.linspace(0.0, 1.0, 33)  # of the range in which lengths are off at random,
+MAX_SCALE_ROUNDS = 12  # cut again in each round
+NORMAL_MEDIAN_DEVIATION = 0.6745  # of a Gaussian's absolute value, in sigmas
 
 
-def common_share(drawn: Array, change: Array, found: Array, covariance: Array) -> float:
+def estimate_common_length_change(
+    nominal_mdh: Array, mdh_change: Array, is_identified: Array, covariance: Array
+) -> float:
     """The share by which the lengths of a fit changed together, 0 where that may be chance.
 
     The lengths must agree on it, or nearly so where it is more than the angles let expect: of arms
     that are drawn to OFF_LENGTH and OFF_ANGLE, times one factor.  Each counts by its own sigma
     beside what lengths are off at random.  A share that a warm arm may have is none.
 
-    drawn, change: (n, 5) rows [m, rad].  found: (n, 5) True where identified.  covariance:
-    (5n, 5n) of the changes, in the order of `parameters.links_of`, with what the model lacks.
+    nominal_mdh, mdh_change: (n, 5) rows [m, rad].  is_identified: (n, 5) True where identified.
+    covariance: (5n, 5n) of the changes, in the order of `parameters.flatten_link_parameters`, with
+    what the model lacks.
     """
-    lengths = found[:, :2] & (np.abs(drawn[:, :2]) > LEAST_LENGTH)
-    angles = np.abs(change[:, 2:][found[:, 2:]])
+    lengths = is_identified[:, :2] & (np.abs(nominal_mdh[:, :2]) > LEAST_LENGTH)
+    angles = np.abs(mdh_change[:, 2:][is_identified[:, 2:]])
     if lengths.sum() < FEWEST or len(angles) < FEWEST:
         return 0.0
-    place = np.arange(2 * len(drawn)).reshape(2, -1).T[lengths]
-    length, more = drawn[:, :2][lengths], change[:, :2][lengths]
+    place = np.arange(2 * len(nominal_mdh)).reshape(2, -1).T[lengths]
+    length, more = nominal_mdh[:, :2][lengths], mdh_change[:, :2][lengths]
     own = covariance[np.ix_(place, place)]
-    share, sigma = agreed(length, more, own, 0.0)
+    share, sigma = weighted_relative_change(length, more, own, 0.0)
     chance = 2.0 * float(stdtr(len(length) - 1, -abs(share) / sigma))
-    usual = float(np.median(angles)) / MEDIAN / OFF_ANGLE * OFF_LENGTH
+    usual = float(np.median(angles)) / NORMAL_MEDIAN_DEVIATION / OFF_ANGLE * OFF_LENGTH
     clear = chance < MAX_P_VALUE or (
         chance < MAX_DOUBTFUL_P_VALUE
-        and abs(share) > MIN_CLEAR_SIGMAS * agreed(length, more, own, usual)[1]
+        and abs(share) > MIN_CLEAR_SIGMAS * weighted_relative_change(length, more, own, usual)[1]
     )
-    return share if clear and abs(share) > LEAST_SHARE else 0.0
+    return share if clear and abs(share) > MIN_SCALE_ERROR else 0.0
 
 
-def agreed(length: Array, more: Array, own: Array, least: float) -> tuple[float, float]:
+def weighted_relative_change(
+    length: Array, changes: Array, variances: Array, min_sigma: float
+) -> tuple[float, float]:
     """The share of lengths (k,) by which they changed, more (k,), and its sigma.
 
-    own: (k, k) covariance of the changes.  least: sigma of what lengths are off at random, at
-    least; as much as their disagreement asks for [Mandel and Paule 1970].
+    variances: (k, k) covariance of the changes.  min_sigma: sigma of what lengths are off at
+    random, at least; as much as their disagreement asks for [Mandel and Paule 1970].
     """
-    variance, axes = np.linalg.eigh(own)
-    along, turned = axes.T @ length, axes.T @ more
+    variance, axes = np.linalg.eigh(variances)
+    along, turned = axes.T @ length, axes.T @ changes
 
     def at(size: Array) -> tuple[Array, Array, Array]:
         weight = 1.0 / (variance + size[:, None] ** 2)
@@ -83,39 +92,45 @@ def agreed(length: Array, more: Array, own: Array, least: float) -> tuple[float,
         left = (weight * (turned - share[:, None] * along) ** 2).sum(axis=-1)
         return left, share, total**-0.5
 
-    low, high = 1e-9, float(np.sqrt(more @ more)) + 1e-9
-    for _ in range(ROUNDS):
-        tried = low * (high / low) ** PARTS
+    low, high = 1e-9, float(np.sqrt(changes @ changes)) + 1e-9
+    for _ in range(MAX_SCALE_ROUNDS):
+        tried = low * (high / low) ** NUISANCE_FRACTIONS
         above = int((at(tried)[0] > len(length) - 1).sum())  # it falls with the size
         if not above:
             break
         low, high = tried[above - 1], tried[min(above, len(tried) - 1)]
-    _, share, sigma = at(np.array([max(low, least)]))
+    _, share, sigma = at(np.array([max(low, min_sigma)]))
     return float(share[0]), float(sigma[0])
 
 
-def with_lack(robot: Robot, model: Model, state: State) -> tuple[Array, Array]:
+def links_with_lack_of_fit(
+    robot: Robot, model: PointModel, state: ParameterValues
+) -> tuple[Array, Array]:
     """How far what the model lacks has moved the links of a fit, and their covariance with it.
 
     The lack is one of smooth functions of the pose, as large as the fit's errors say
     (`modelling.lack`): joints that bend stretch an arm as a scale would, but leave errors.
     model: of the fitted poses.  Returns (5n,) and (5n, 5n) [m, rad], zero where not identified.
     """
-    n, active = robot.joints, model.active[: model.names.geometric]
-    seen = np.broadcast_to(model.seen.T[..., None], (*model.seen.T.shape, 3)).reshape(-1)
-    every = model.jacobian(state)[..., : model.names.geometric]
+    n, active = robot.joints, model.active[: model.names.geometric_count]
+    seen = np.broadcast_to(
+        model.measured_mask.T[..., None], (*model.measured_mask.T.shape, 3)
+    ).reshape(-1)
+    every = model.point_jacobian(state)[..., : model.names.geometric_count]
     m, k, _, p = every.shape
-    error = model.error(state).reshape(-1)[seen]
-    arm = every.reshape(m, 3 * k, p)[..., zero_positions(robot.prismatic)]
-    columns, kind = by_pose(robot.with_mdh(state.mdh), model.q, arm)
+    error = model.point_errors(state).reshape(-1)[seen]
+    arm = every.reshape(m, 3 * k, p)[..., joint_zero_indices(robot.prismatic)]
+    columns, kind = lack_of_fit_motions_by_pose(robot.with_mdh(state.mdh), model.q, arm)
     lack = columns.reshape(3 * k * m, -1)[seen]
     rows = every.reshape(-1, p)[seen][:, active]
     back = np.linalg.pinv(rows)
     left = lack - rows @ (back @ lack)
     dof = max(len(error) - rows.shape[1], 1)
-    found = fit_components(left.T @ lack, left.T @ error, float(error @ error), dof, kind[:, 1])
+    found = fit_variance_components(
+        left.T @ lack, left.T @ error, float(error @ error), dof, kind[:, 1]
+    )
     moved = back @ lack
-    spread = found.moment - np.outer(found.mean, found.mean)
+    spread = found.second_moment - np.outer(found.mean, found.mean)
     shift, covariance = np.zeros(p), np.zeros((p, p))
     shift[active] = back @ error - moved @ found.mean
     covariance[np.ix_(active, active)] = found.noise * back @ back.T + moved @ spread @ moved.T
@@ -123,29 +138,33 @@ def with_lack(robot: Robot, model: Model, state: State) -> tuple[Array, Array]:
 
 
 @dataclass(frozen=True)
-class Scale:
+class PointScale:
     """factor: 1 + s by which the points are too long.  gain: in twice the log likelihood."""
 
     factor: float
     gain: float
 
 
-def scale_of(robot: Robot, data: Measurements, at: State) -> Scale:
+def estimate_point_scale(robot: Robot, data: Measurements, state: ParameterValues) -> PointScale:
     """The common factor that the points of a drawn arm suggest, its links linear at a state.
 
-    at: the drawn arm in its place; or as its links explain the points best, which far off are not
-    linear at the drawing: `with_links`.
+    state: the drawn arm in its place; or as its links explain the points best, which far off are
+    not linear at the drawing: `fit_state_with_links`.
     """
-    rows = np.linspace(0, data.poses - 1, min(data.poses, POSES)).astype(int)
-    model = model_of(robot, data.take(rows))
-    n, p = 5 * robot.joints, model.names.geometric
-    seen = np.broadcast_to(model.seen.T[..., None], (*model.seen.T.shape, 3)).reshape(-1)
-    every = model.jacobian(at).reshape(-1, p)[seen]
-    error = model.error(at).reshape(-1)[seen] + every[:, :n] @ links_of(at.mdh - robot.mdh)
-    links_at = kinematics.chain(at.mdh, model.q, model.prismatic)
-    drawn = kinematics.points(links_at, at.target_positions)  # measured ones hold error
+    rows = np.linspace(0, data.poses - 1, min(data.poses, MAX_SCALE_POSES)).astype(int)
+    model = build_point_model(robot, data.take(rows))
+    n, p = 5 * robot.joints, model.names.geometric_count
+    seen = np.broadcast_to(
+        model.measured_mask.T[..., None], (*model.measured_mask.T.shape, 3)
+    ).reshape(-1)
+    every = model.point_jacobian(state).reshape(-1, p)[seen]
+    error = model.point_errors(state).reshape(-1)[seen] + every[:, :n] @ flatten_link_parameters(
+        state.mdh - robot.mdh
+    )
+    links_at = kinematics.compute_link_frames(state.mdh, model.q, model.prismatic)
+    drawn = kinematics.targets_in_base(links_at, state.target_positions)  # measured ones hold error
     points = np.moveaxis(drawn, -1, 0).reshape(-1)[seen]
-    sigma = off_by(robot)
+    sigma = nominal_link_deviations(robot)
     columns = np.column_stack([every[:, n:], every[:, :n] * sigma, points, error])
     triangle = np.asarray(np.linalg.qr(columns, mode="r"))
     reduced = triangle[p - n :, p - n :]  # beside base and targets
@@ -154,32 +173,40 @@ def scale_of(robot: Robot, data: Measurements, at: State) -> Scale:
     inside = np.array([u.T @ left, u.T @ stretch])
     outside = np.array([left - u @ inside[0], stretch - u @ inside[1]])
     free = max(len(error) - p, 1) - len(size)
-    without, with_it, change = best(size, inside, outside, free)
-    return Scale(1.0 + change, 2.0 * (with_it - without))
+    without, with_it, change = maximise_scale_likelihood(size, inside, outside, free)
+    return PointScale(1.0 + change, 2.0 * (with_it - without))
 
 
-def with_links(robot: Robot, data: Measurements, at: State) -> State:
+def fit_state_with_links(
+    robot: Robot, data: Measurements, state: ParameterValues
+) -> ParameterValues:
     """As base, targets and links fit the points best, links that none shows as drawn."""
-    model = model_of(robot, data)
-    weight = np.zeros(model.names.count)
-    weight[: 5 * robot.joints] = (NOISES[0] / (FACTORS[-1] * off_by(robot))) ** 2
-    found = nearby(model.with_prior(replace(model.prior, weight=weight)), at)
+    model = build_point_model(robot, data)
+    weight = np.zeros(model.names.parameter_count)
+    weight[: 5 * robot.joints] = (
+        TRIAL_NOISES[0] / (LINK_VARIANCE_FACTORS[-1] * nominal_link_deviations(robot))
+    ) ** 2
+    found = fit_nearby(model.with_prior(replace(model.prior, weight=weight)), state)
     return found.x.take(np.array(0))
 
 
-def off_by(robot: Robot) -> Array:
+def nominal_link_deviations(robot: Robot) -> Array:
     """(5n,) how far links are off as drawn, before any factor [m, rad]."""
     return np.repeat([OFF_LENGTH, OFF_ANGLE], [2 * robot.joints, 3 * robot.joints])
 
 
-def best(size: Array, inside: Array, outside: Array, free: int) -> tuple[float, float, float]:
+def maximise_scale_likelihood(
+    size: Array, inside: Array, outside: Array, free: int
+) -> tuple[float, float, float]:
     """The largest log likelihood over factors and noises, without a scale and with it; the scale.
 
     size: singular values of the links' columns.  inside, outside: error and stretch along these
     columns, and beside them.  free: numbers beside them.
     """
-    variance = (FACTORS[:, None, None] * size) ** 2 + NOISES[:, None] ** 2  # (f, v, r)
-    noise, beside = NOISES**2, outside @ outside.T
+    variance = (LINK_VARIANCE_FACTORS[:, None, None] * size) ** 2 + TRIAL_NOISES[
+        :, None
+    ] ** 2  # (f, v, r)
+    noise, beside = TRIAL_NOISES**2, outside @ outside.T
     e, c = inside
     ee, ec, cc = np.moveaxis((1.0 / variance) @ np.array([e * e, e * c, c * c]).T, -1, 0)
     ee, ec, cc = ee + beside[0, 0] / noise, ec + beside[0, 1] / noise, cc + beside[1, 1] / noise
@@ -193,7 +220,7 @@ def best(size: Array, inside: Array, outside: Array, free: int) -> tuple[float, 
 
 
 @dataclass(frozen=True)
-class ScaleOfLengths:
+class LengthScale:
     """By which share the arm's lengths come out longer than drawn, as one factor.
 
     sigma: of that, by instrument, drawing and by how little one factor explains.  p_value: of no
@@ -205,7 +232,7 @@ class ScaleOfLengths:
     p_value: float
 
 
-def but_for_tool(robot: Robot) -> Array:
+def is_not_tool_length(robot: Robot) -> Array:
     """(5n,) False for lengths of the last link, which are those of the tool and may be anything."""
     number = np.arange(5 * robot.joints)
     last = (number % robot.joints) == robot.joints - 1
@@ -214,14 +241,14 @@ def but_for_tool(robot: Robot) -> Array:
 
 def fit_scale_of_lengths(
     robot: Robot, links: Array, change: Array, covariance: Array
-) -> ScaleOfLengths | None:
+) -> LengthScale | None:
     """One factor of all lengths, by generalised least squares; None where no length tells it.
 
     links: (l,) indices of links that were fitted.  change: (l,) from the drawing.  covariance:
     (l, l) of the fit and of the drawing together [m, rad].
     """
     lengths = np.arange(5 * robot.joints) < 2 * robot.joints
-    drawn = np.where(lengths, links_of(robot.mdh), 0.0)[links]
+    drawn = np.where(lengths, flatten_link_parameters(robot.mdh), 0.0)[links]
     dof = len(drawn) - 1
     if not drawn.any() or dof < 1:
         return None
@@ -231,4 +258,4 @@ def fit_scale_of_lengths(
     share = float(white[:, 0] @ white[:, 1]) / told
     left = float(((white[:, 1] - share * white[:, 0]) ** 2).sum()) / dof
     sigma = float(np.sqrt(max(left, 1.0) / told))
-    return ScaleOfLengths(share, sigma, float(2.0 * stdtr(dof, -abs(share) / sigma)))
+    return LengthScale(share, sigma, float(2.0 * stdtr(dof, -abs(share) / sigma)))

@@ -14,67 +14,94 @@ from typing import TYPE_CHECKING, Annotated, Any, overload
 import numpy as np
 import scipy
 
+from minimax_cal.core.arrays import Array, rms
+from minimax_cal.core.display_text import capitalise_sentence, format_counts
+from minimax_cal.core.files import read_saved_json
+from minimax_cal.core.record_fields import (
+    SEPARATE_FIELD_FORMAT,
+    FieldFormat,
+    LazyValue,
+    derived_field,
+    format_record_fields,
+    record_to_file_values,
+    scale_numbers,
+)
+from minimax_cal.core.record_parsing import parse_array, parse_as_type, parse_record
+from minimax_cal.core.results import Result
+from minimax_cal.core.tables import Table, drop_empty_tables
 from minimax_cal.fitting.accuracy import (
-    HELD,
-    NO_ENDS,
-    UNKNOWN,
+    IS_HELD_BY_KEY,
+    UNKNOWN_ENDS,
+    UNKNOWN_INTERVAL,
     Accuracy,
     Interval,
-    accuracy,
-    before_and_after,
-    by_key,
-    with_ends,
+    accuracy_before_and_after,
+    split_errors_by_key,
+    summarise_point_errors,
+    with_intervals,
 )
-from minimax_cal.fitting.between_sessions import Change
-from minimax_cal.fitting.beyond import Beyond
-from minimax_cal.fitting.crossed import NOT_CROSSED, Within, intervals_of
-from minimax_cal.fitting.disagreement import Contradiction
-from minimax_cal.fitting.found import Parameter, Parameters, parameter_table, table_of_effects
-from minimax_cal.fitting.identify import Identification
-from minimax_cal.fitting.minimax_problem import Certificate, Distances, trusted_distances
+from minimax_cal.fitting.contradiction import Contradiction
+from minimax_cal.fitting.cross_validation import (
+    NO_CROSS_VALIDATED_ERRORS,
+    UnseenAccuracy,
+    error_intervals,
+)
+from minimax_cal.fitting.identification import Identification
+from minimax_cal.fitting.joint_spans import JointSpan, measure_joint_spans
+from minimax_cal.fitting.minimax_problem import Certificate, TargetDistanceLimits, trusted_distances
 from minimax_cal.fitting.options import Options, read_options
-from minimax_cal.fitting.pose_rows import errors_of, measured_poses, pose_rows
-from minimax_cal.fitting.set_aside import aside_sentence
-from minimax_cal.fitting.spans import Span, spans_of
-from minimax_cal.fitting.suspects import Suspect, aside, table_of
+from minimax_cal.fitting.outliers import Outlier, mask_outliers, outlier_table
+from minimax_cal.fitting.parameter_results import (
+    Parameter,
+    Parameters,
+    effect_parameter_table,
+    geometry_parameter_table,
+)
+from minimax_cal.fitting.pose_records import (
+    build_pose_records,
+    compute_or_restore_errors,
+    parse_measured_poses,
+)
+from minimax_cal.fitting.region_holdout import RegionHoldout
+from minimax_cal.fitting.session_changes import SessionChange
+from minimax_cal.fitting.set_aside_points import describe_points_set_aside
 from minimax_cal.fitting.uncertainty import Estimator, Uncertainty, uncertainty_from_dict
-from minimax_cal.ground.arrays import Array, rms
-from minimax_cal.ground.facts import APART, Fact, Later, derived, facts_in_words, in_file, scaled
-from minimax_cal.ground.files import saved_content
-from minimax_cal.ground.records import array, as_kind, read
-from minimax_cal.ground.results import Result
-from minimax_cal.ground.tables import Table, filled
-from minimax_cal.ground.words import capitalise, list_counts
-from minimax_cal.measuring.grouping import clusters, grouped
-from minimax_cal.measuring.history import with_history
-from minimax_cal.measuring.measurements import Measurements, SetAside
+from minimax_cal.measuring.measurements import Measurements, SetAsidePoint
+from minimax_cal.measuring.pose_groups import cluster_poses, group_for_holdout
+from minimax_cal.measuring.visit_history import add_history_columns
 from minimax_cal.modelling.cell import Cell, cell_from_dict
-from minimax_cal.modelling.effects.scene import joint_of
+from minimax_cal.modelling.cell_frames import (
+    WITH_EFFECTS_SUFFIX,
+    build_cell_frame_tables,
+    build_cell_frames,
+    format_frame_name,
+    name_frames_with_effects,
+)
+from minimax_cal.modelling.effects.effect_names import format_effect
+from minimax_cal.modelling.effects.scene import joint_index_from_place
 from minimax_cal.modelling.effects.table import EFFECTS
-from minimax_cal.modelling.effects.words import name_effect
-from minimax_cal.modelling.frames import WHOLE, frames_of, in_words, tables_of, with_effects
-from minimax_cal.modelling.joint_fit import extended
-from minimax_cal.modelling.model import NO_MIX, model_of, pose_weights
-from minimax_cal.modelling.parameters import Names
+from minimax_cal.modelling.effects_in_model import extend_model_with_effects
+from minimax_cal.modelling.parameters import ParameterNames
+from minimax_cal.modelling.point_model import NO_POSE_MIX, build_point_model, pose_error_weights
 from minimax_cal.robots.robot import Robot
-from minimax_cal.robots.transforms import CONVENTION, Frame, frames_tables
+from minimax_cal.robots.transforms import ABC_ANGLES_CONVENTION, Frame, build_frame_tables
 from minimax_cal.solvers.linearisation import Kkt
 from minimax_cal.solvers.minimax import Step
 from minimax_cal.solvers.status import Status
 
 if TYPE_CHECKING:  # it imports this module
-    from minimax_cal.fitting.several.result import RelativeCalibration
+    from minimax_cal.fitting.multi_instrument.relative_result import RelativeCalibration
 
-POSE_BY_POSE = ("weights", "share", "crossed", "drawn crossed")  # arrays of a file
-PACKAGES = ("minimax-cal", "numpy", "scipy", "qpsolvers")
-ACCURACIES = (  # where accuracy is told: title, key
+POSE_ARRAY_NAMES = ("weights", "share", "crossed", "drawn crossed")  # arrays of a file
+VERSIONED_PACKAGES = ("minimax-cal", "numpy", "scipy", "qpsolvers")
+ACCURACY_TITLES_AND_KEYS = (  # where accuracy is told: title, key
     ("held out, nominal", "nominal"),
     ("held out, calibrated", "holdout"),
     ("training, nominal", "nominal_train"),
     ("training, calibrated", "train"),
 )
-PLACED = ("base", "tool")  # frames on the first screen
-ROUGH = 1e-6  # a QP answered worse than this is told
+FIRST_SCREEN_FRAMES = ("base", "tool")  # frames on the first screen
+MAX_SILENT_QP_RESIDUAL = 1e-6  # a QP answered worse than this is told
 
 
 @dataclass(frozen=True)
@@ -88,16 +115,16 @@ class Provenance:
     versions: Mapping[str, str] = field(default_factory=dict)
 
     @staticmethod
-    def of(robot: Robot, data: Measurements, settings: Mapping[str, object]) -> Provenance:
+    def from_run(robot: Robot, data: Measurements, settings: Mapping[str, object]) -> Provenance:
         """Of this run, on this machine."""
-        return Provenance(robot.name, data.source, data.digest, dict(settings), versions())
+        return Provenance(robot.name, data.source, data.digest, dict(settings), package_versions())
 
 
 @cache
-def versions() -> Mapping[str, str]:
+def package_versions() -> Mapping[str, str]:
     """Of the packages that a result depends on: asked once, for it takes as long as a fit."""
     loaded = {"numpy": np.__version__, "scipy": scipy.__version__}
-    found = {name: loaded.get(name) or version(name) for name in PACKAGES}
+    found = {name: loaded.get(name) or version(name) for name in VERSIONED_PACKAGES}
     return found | {"python": platform.python_version()}
 
 
@@ -106,12 +133,12 @@ class KeptDistance:
     """A distance between two targets that the minimax keeps [m]."""
 
     pair: tuple[str, str]
-    measured: Annotated[float, Fact(key="measured_mm", scale=1e3)]
-    tolerance: Annotated[float, Fact(key="tolerance_mm", scale=1e3)]
+    measured: Annotated[float, FieldFormat(key="measured_mm", scale=1e3)]
+    tolerance: Annotated[float, FieldFormat(key="tolerance_mm", scale=1e3)]
     multiplier: float
 
     @property
-    def between(self) -> str:
+    def target_pair_text(self) -> str:
         """Which targets, for people."""
         return " - ".join(self.pair)
 
@@ -126,7 +153,7 @@ class WorstCase:
 
     functions: tuple[str, ...]
     size: Array
-    multiplier: Annotated[Array, Fact(key="multipliers")]
+    multiplier: Annotated[Array, FieldFormat(key="multipliers")]
     active: tuple[str, ...]
     distances: tuple[KeptDistance, ...]
     kkt: Kkt
@@ -140,7 +167,7 @@ class WorstCase:
     def table(self) -> Table:
         """Errors of targets or points, multipliers (they sum to one), activity."""
         active = (name in self.active for name in self.functions)
-        return Table.made(
+        return Table.from_rows(
             "what the worst error on the training poses rests on; targets compare by F_i over the "
             "number of their points",
             zip(self.functions, self.size, self.multiplier, active, strict=True),
@@ -149,7 +176,7 @@ class WorstCase:
 
 
 @dataclass(frozen=True)
-class Work:
+class SolverWork:
     """What the solvers did.
 
     least_squares: the method that led to the start of the minimax.  steps: of it.
@@ -168,8 +195,8 @@ class Work:
 class Fit(Result):
     """A calibrated robot and everything that is known about its fit.
 
-    A field is in the file by itself unless it is `APART`, as is a property that is `derived`; what
-    has words is shown in the terminal, the report and the page.
+    A field is in the file by itself unless it is `SEPARATE_FIELD_FORMAT`, as is a property that is
+    `derived_field`; what has words is shown in the terminal, the report and the page.
 
     cell: the calibrated robot with base, targets and effects, all fitted together; it predicts.
     nominal: the nominal robot with its best base and targets.
@@ -199,41 +226,45 @@ class Fit(Result):
     KIND = "calibration"
     COMMAND = "calibrate"
 
-    cell: Annotated[Cell, APART]
-    nominal: Annotated[Cell, APART]
+    cell: Annotated[Cell, SEPARATE_FIELD_FORMAT]
+    nominal: Annotated[Cell, SEPARATE_FIELD_FORMAT]
     objective: str
     qp: str
     status: Status
-    iterations: Annotated[int, Fact("{} iterations")]
-    seconds: Annotated[float, Fact("{:.2f} s")]
-    parameters: Annotated[Parameters, APART]
-    accuracy: Annotated[Mapping[str, Accuracy], APART]
-    identification: Annotated[Identification, APART]
-    uncertainty: Annotated[Uncertainty, APART]
-    minimax: Annotated[WorstCase | None, Fact(brief=True)]
-    certificate: Annotated[Certificate | None, Fact(brief=True)]
-    trace: Annotated[tuple[float, ...], Fact(key="trace_mm2", scale=1e6)]
-    data: Annotated[Measurements, APART]
-    held: Annotated[Array, APART]
-    error_nominal: Annotated[Array, APART]
-    error: Annotated[Array, APART]
+    iterations: Annotated[int, FieldFormat("{} iterations")]
+    seconds: Annotated[float, FieldFormat("{:.2f} s")]
+    parameters: Annotated[Parameters, SEPARATE_FIELD_FORMAT]
+    accuracy: Annotated[Mapping[str, Accuracy], SEPARATE_FIELD_FORMAT]
+    identification: Annotated[Identification, SEPARATE_FIELD_FORMAT]
+    uncertainty: Annotated[Uncertainty, SEPARATE_FIELD_FORMAT]
+    minimax: Annotated[WorstCase | None, FieldFormat(brief=True)]
+    certificate: Annotated[Certificate | None, FieldFormat(brief=True)]
+    trace: Annotated[tuple[float, ...], FieldFormat(key="trace_mm2", scale=1e6)]
+    data: Annotated[Measurements, SEPARATE_FIELD_FORMAT]
+    held: Annotated[Array, SEPARATE_FIELD_FORMAT]
+    error_nominal: Annotated[Array, SEPARATE_FIELD_FORMAT]
+    error: Annotated[Array, SEPARATE_FIELD_FORMAT]
     notices: tuple[str, ...]
     loss: str
-    suspects: tuple[Suspect, ...]
-    weights: Annotated[Array, APART]
-    share: Annotated[Array, APART]
-    prior: Annotated[Array, APART]
+    suspects: tuple[Outlier, ...]
+    weights: Annotated[Array, SEPARATE_FIELD_FORMAT]
+    share: Annotated[Array, SEPARATE_FIELD_FORMAT]
+    prior: Annotated[Array, SEPARATE_FIELD_FORMAT]
     widening: float
     provenance: Provenance
-    claim: Annotated[Later[Beyond], APART]
-    error_crossed: Annotated[Array, APART] = field(default_factory=NOT_CROSSED.copy)
-    set_aside: tuple[SetAside, ...] = ()
+    claim: Annotated[LazyValue[RegionHoldout], SEPARATE_FIELD_FORMAT]
+    error_crossed: Annotated[Array, SEPARATE_FIELD_FORMAT] = field(
+        default_factory=NO_CROSS_VALIDATED_ERRORS.copy
+    )
+    set_aside: tuple[SetAsidePoint, ...] = ()
     answered: Mapping[str, int] = field(default_factory=dict)
-    work: Work = Work()
-    stated_geometric: Annotated[Cell | None, APART] = None
-    error_drawn_crossed: Annotated[Array, APART] = field(default_factory=NOT_CROSSED.copy)
+    work: SolverWork = SolverWork()
+    stated_geometric: Annotated[Cell | None, SEPARATE_FIELD_FORMAT] = None
+    error_drawn_crossed: Annotated[Array, SEPARATE_FIELD_FORMAT] = field(
+        default_factory=NO_CROSS_VALIDATED_ERRORS.copy
+    )
     reason: str = ""
-    moved: Annotated[tuple[Change, ...], Fact(key="between_sessions")] = ()
+    moved: Annotated[tuple[SessionChange, ...], FieldFormat(key="between_sessions")] = ()
     contradictions: tuple[Contradiction, ...] = ()
 
     @classmethod
@@ -248,7 +279,10 @@ class Fit(Result):
         given are of least squares of all training points, without priors.  accuracy: what is to be
         added to that of these errors.
         """
-        scores = {key: accuracy(error) for key, error in by_key(*errors, held).items()}
+        scores = {
+            key: summarise_point_errors(error)
+            for key, error in split_errors_by_key(*errors, held).items()
+        }
         derived_fields: dict[str, Any] = {
             "cell": cell,
             "nominal": nominal,
@@ -266,9 +300,9 @@ class Fit(Result):
             "suspects": (),
             "weights": data.take(~held).seen.T.astype(float),
             "share": np.ones(len(data.target_names)),
-            "prior": np.zeros(uncertainty.names.count),
+            "prior": np.zeros(uncertainty.names.parameter_count),
             "widening": 1.0,
-            "provenance": Provenance.of(nominal.robot, data, settings),
+            "provenance": Provenance.from_run(nominal.robot, data, settings),
         }
         accuracies = scores | fields.pop("accuracy", {})
         return cls(**derived_fields | fields, accuracy=accuracies)
@@ -287,10 +321,10 @@ class Fit(Result):
         Beside effects it is fitted without them: that of `cell` is right only together with them.
         The drawn one where its status keeps that.
         """
-        return self.kept.robot
+        return self.usable_cell.robot
 
     @property
-    def kept(self) -> Cell:
+    def usable_cell(self) -> Cell:
         """The arm to use: `geometric`, or the drawn one in its place where that is kept."""
         return self.nominal if self.status.keeps_drawn else self.geometric
 
@@ -302,11 +336,11 @@ class Fit(Result):
         """
         if self.stated_geometric is not None:
             return self.stated_geometric
-        if not self.cell.effects.causes:
+        if not self.cell.effects.cause_terms:
             return self.cell
-        from minimax_cal.fitting.calibrate import again
+        from minimax_cal.fitting.calibrate import refit_with_options
 
-        return again(self, effects=()).cell
+        return refit_with_options(self, effects=()).cell
 
     @property
     def train(self) -> Measurements:
@@ -314,25 +348,27 @@ class Fit(Result):
         return self.data.take(~self.held)
 
     @cached_property
-    def beyond(self) -> Beyond:
+    def beyond(self) -> RegionHoldout:
         """On whole parts that were left out; looked for when it is first asked for."""
         return self.claim.value
 
     @property
-    def spans(self) -> tuple[Span, ...]:
+    def spans(self) -> tuple[JointSpan, ...]:
         """How far each joint went in the training poses."""
         train = self.train
-        return spans_of(self.cell.robot, train) if train.poses else self.beyond.spans
+        return measure_joint_spans(self.cell.robot, train) if train.poses else self.beyond.spans
 
     @property
     def errors(self) -> Mapping[str, Array]:
         """Errors (m, k, 3) by the keys of `accuracy` [m]."""
-        return by_key(self.error_nominal, self.error, self.held)
+        return split_errors_by_key(self.error_nominal, self.error, self.held)
 
     @property
     def trusted(self) -> Accuracy:
         """On the held-out points that do not stand out."""
-        return accuracy(aside(self.error, self.data, self.suspects)[self.held])
+        return summarise_point_errors(
+            mask_outliers(self.error, self.data, self.suspects)[self.held]
+        )
 
     @property
     def with_them(self) -> Accuracy | None:
@@ -344,12 +380,12 @@ class Fit(Result):
         """(p, p) of all parameters, NaN where not identified [SI, base in its own axes]."""
         return self.uncertainty.covariance
 
-    @derived("condition {:.3g}")
+    @derived_field("condition {:.3g}")
     def condition(self) -> float:
         """Condition number of what was identified."""
         return self.identification.condition
 
-    @derived()
+    @derived_field()
     def advice(self) -> str:
         """What to do where it failed or keeps the drawn arm, else what its status advises."""
         return self.reason or self.status.advice
@@ -367,26 +403,32 @@ class Fit(Result):
     @property
     def group(self) -> Array:
         """(training poses,) rows with one number belong together: a pose, or a cluster of poses."""
-        return clusters(self.train)
+        return cluster_poses(self.train)
 
     @cached_property
-    def distances(self) -> Distances:
+    def distances(self) -> TargetDistanceLimits:
         """Between targets, as the believed training points tell them."""
         return trusted_distances(self.train, self.weights, self.options.distance_tolerance)
 
     @cached_property
     def estimator(self) -> Estimator:
         """How the fit weighed its poses, linear where it ended."""
-        train, state = self.train, self.cell.state
-        model = model_of(self.nominal.robot, train)
+        train, state = self.train, self.cell.parameter_values
+        model = build_point_model(self.nominal.robot, train)
         if self.cell.effects.terms:
-            model, _ = extended(model, self.nominal.robot, train, state, self.cell.effects.terms)
-        model = model.only(self.identification.active)
+            model, _ = extend_model_with_effects(
+                model, self.nominal.robot, train, state, self.cell.effects.terms
+            )
+        model = model.with_active(self.identification.active)
         model = model.with_prior(replace(model.prior, weight=self.prior))
-        mix = pose_weights(train, self.options.lever) if self.objective == "pose" else NO_MIX
+        mix = (
+            pose_error_weights(train, self.options.lever)
+            if self.objective == "pose"
+            else NO_POSE_MIX
+        )
         weights = self.weights
         if len(mix):  # a pose needs all of its targets
-            weights = np.where(model.seen, weights, 1.0).min(axis=0)
+            weights = np.where(model.measured_mask, weights, 1.0).min(axis=0)
         return Estimator(replace(model, weight=model.weight * weights), self.share, mix)
 
     @cached_property
@@ -399,14 +441,14 @@ class Fit(Result):
         if any(one.rms_ci95_mm for one in seen.values()):
             return {
                 key: (
-                    Interval(*scaled(one.rms_ci95_mm or NO_ENDS, 1e-3)),
-                    Interval(*scaled(one.max_ci95_mm or NO_ENDS, 1e-3)),
+                    Interval(*scale_numbers(one.rms_ci95_mm or UNKNOWN_ENDS, 1e-3)),
+                    Interval(*scale_numbers(one.max_ci95_mm or UNKNOWN_ENDS, 1e-3)),
                 )
                 for key, one in seen.items()
             }
         rng = np.random.default_rng(self.options.seed)
-        group = grouped(self.data, self.options.holdout_by)[self.held]
-        return {key: intervals_of(self.errors[key], group, rng) for key in seen}
+        group = group_for_holdout(self.data, self.options.holdout_by)[self.held]
+        return {key: error_intervals(self.errors[key], group, rng) for key in seen}
 
     @property
     def unjudged(self) -> Array:
@@ -419,24 +461,32 @@ class Fit(Result):
         return np.asarray(self.data.line[told & ~judged])
 
     @cached_property
-    def within(self) -> Within:
+    def within(self) -> UnseenAccuracy:
         """Before and after on poses that the fit had not seen: cross-validated, or held out."""
-        group = grouped(self.data, self.options.holdout_by) if self.data.poses else np.zeros(0)
+        group = (
+            group_for_holdout(self.data, self.options.holdout_by)
+            if self.data.poses
+            else np.zeros(0)
+        )
         if self.error_crossed.size:
             judged = np.isfinite(self.error_crossed).any(axis=(1, 2))
-            after = accuracy(self.error_crossed)
+            after = summarise_point_errors(self.error_crossed)
             drawn = self.error_drawn_crossed
-            before = accuracy(np.where(np.isfinite(self.error_crossed), drawn, np.nan))
+            before = summarise_point_errors(
+                np.where(np.isfinite(self.error_crossed), drawn, np.nan)
+            )
             missed = len(self.unjudged)
             of = f" of {after.poses + missed}" if missed else ""
             where = f"{after.poses}{of} poses, each judged by a fit without it"
-            ends = intervals_of(self.error_crossed, group, self.options.seed)
-            return Within(before, after, where, len(np.unique(group[judged])), *ends, missed)
-        before, after, where = before_and_after(self.accuracy)
+            ends = error_intervals(self.error_crossed, group, self.options.seed)
+            return UnseenAccuracy(
+                before, after, where, len(np.unique(group[judged])), *ends, missed
+            )
+        before, after, where = accuracy_before_and_after(self.accuracy)
         if not self.accuracy["holdout"].poses:
-            return Within(before, after, where)
+            return UnseenAccuracy(before, after, where)
         poses = len(np.unique(group[self.held])) or after.poses
-        return Within(before, after, where, poses, *self.intervals["holdout"])
+        return UnseenAccuracy(before, after, where, poses, *self.intervals["holdout"])
 
     def predict(self, q: Array) -> Array:
         """Where the instrument should see each target: (m, k, 3) [m].  q: (m, n) [rad, m]."""
@@ -450,12 +500,12 @@ class Fit(Result):
         """
         return self.cell.inverse(pose, near)
 
-    def accuracies(self) -> Iterator[tuple[str, Accuracy]]:
+    def list_accuracies(self) -> Iterator[tuple[str, Accuracy]]:
         """What the table of accuracy tells, with titles."""
         if self.error_crossed.size:
             yield "cross-validated, nominal", self.within.before
             yield "cross-validated, calibrated", self.within.after
-        for title, key in ACCURACIES:
+        for title, key in ACCURACY_TITLES_AND_KEYS:
             yield title, self.accuracy[key]
             if key == "holdout" and any(one.held for one in self.suspects):
                 yield f"{title}, without suspects", self.trusted
@@ -464,36 +514,42 @@ class Fit(Result):
 
     def accuracy_table(self) -> Table:
         """Accuracy before and after, on the held-out and on the training poses."""
-        return Table.made(
+        return Table.from_rows(
             f"{self.cell.robot.name}: position accuracy, objective {self.objective}",
-            [(title, a.poses, a.rms_mm, a.mean_mm, a.max_mm, *a.by_target())
-             for title, a in self.accuracies()],
+            [(title, a.poses, a.rms_mm, a.mean_mm, a.max_mm, *a.rms_by_target())
+             for title, a in self.list_accuracies()],
             "poses | count d | RMS mm .4f | mean mm .4f | max mm .4f",
             *(f"{name} RMS mm .4f" for name in self.cell.target_names),
         )  # fmt: skip
 
     def first_tables(self) -> tuple[Table, ...]:
         """What stands on the first screen: accuracy in at most six rows, and the frames."""
-        first = Table.made(
+        first = Table.from_rows(
             f"position error, objective {self.objective}",
-            [row for row in self.accuracy_rows() if row[1] != 0],
+            [row for row in self.list_accuracy_rows() if row[1] != 0],
             "error at | poses d | RMS mm .3f | 95 % low .3f | 95 % high .3f | max mm .3f",
         )
-        frames, of = self.frames, "" if self.geometric is self.cell else WHOLE
-        shown = {name: frames[name + of] for name in PLACED if name + of in frames}
-        where = f"base in the instrument's frame, tool in the flange's{in_words(of)}"
-        return first, replace(frames_tables(shown, "")[0], title=f"{where}; Rz(A) Ry(B) Rx(C)")
+        frames, of = self.frames, "" if self.geometric is self.cell else WITH_EFFECTS_SUFFIX
+        shown = {name: frames[name + of] for name in FIRST_SCREEN_FRAMES if name + of in frames}
+        where = f"base in the instrument's frame, tool in the flange's{format_frame_name(of)}"
+        return first, replace(build_frame_tables(shown, "")[0], title=f"{where}; Rz(A) Ry(B) Rx(C)")
 
-    def accuracy_rows(self) -> Iterator[tuple[object, ...]]:
+    def list_accuracy_rows(self) -> Iterator[tuple[object, ...]]:
         """New poses, inside and outside the measured region, then those of the fit."""
-        inside, unknown = self.within, scaled(UNKNOWN, 1e3)
+        inside, unknown = self.within, scale_numbers(UNKNOWN_INTERVAL, 1e3)
         if self.error_crossed.size or self.accuracy["holdout"].poses:
-            drawn = UNKNOWN if self.error_crossed.size else self.intervals["nominal"][0]
+            drawn = UNKNOWN_INTERVAL if self.error_crossed.size else self.intervals["nominal"][0]
             for name, seen, ends in (
                 ("nominal", inside.before, drawn),
                 ("calibrated", inside.after, inside.rms),
             ):
-                yield f"new poses, {name}", seen.poses, seen.rms_mm, *scaled(ends, 1e3), seen.max_mm
+                yield (
+                    f"new poses, {name}",
+                    seen.poses,
+                    seen.rms_mm,
+                    *scale_numbers(ends, 1e3),
+                    seen.max_mm,
+                )
         if self.beyond.worst:
             away = self.beyond
             yield "outside, calibrated", "", away.typical_mm, None, None, away.largest_mm
@@ -504,14 +560,14 @@ class Fit(Result):
     def interval_table(self) -> Table:
         """95 % intervals of the held-out accuracy; empty where the poses are too few."""
         rows = [
-            (title, a.rms_mm, *scaled(rms, 1e3), a.max_mm, *scaled(largest, 1e3))
+            (title, a.rms_mm, *scale_numbers(rms, 1e3), a.max_mm, *scale_numbers(largest, 1e3))
             for title, key in (("nominal", "nominal"), ("calibrated", "holdout"))
             for a, (rms, largest) in [(self.accuracy[key], self.intervals[key])]
             if math.isfinite(rms.low)
         ]
         dash = any(np.isnan([row[3], row[6]]).any() for row in rows)
         why = "; a dash: too few poses, or too unlike each other, to tell an upper end"
-        return Table.made(
+        return Table.from_rows(
             "held out, with 95 % intervals: of the RMS over such poses, of the largest error of as "
             f"many new ones{why if dash else ''}",
             rows,
@@ -520,18 +576,19 @@ class Fit(Result):
 
     @property
     def frames(self) -> dict[str, Frame]:
-        """Where base and tool stand, those of the drawn arm, and the corrections: `frames_of`.
+        """Where base and tool stand, those of the drawn arm, and the corrections:
+        `build_cell_frames`.
 
         They go with `robot`; those that go with the effects of the `cell` stand beside them.
         """
-        out = frames_of(self.geometric, self.nominal)
+        out = build_cell_frames(self.geometric, self.nominal)
         if self.geometric is not self.cell:
-            out |= with_effects(frames_of(self.cell, self.nominal))
+            out |= name_frames_with_effects(build_cell_frames(self.cell, self.nominal))
         return out
 
     def parameter_table(self) -> Table:
         """Every parameter of geometry."""
-        return parameter_table(self.parameters)
+        return geometry_parameter_table(self.parameters)
 
     def effect_table(self) -> Table:
         """The parameters of effects beyond geometry, as in the files; empty without any.
@@ -542,19 +599,19 @@ class Fit(Result):
         labels = tuple(f"{term.label}." for term in maps)
         rows: list[tuple[object, ...]] = []
         if maps:
-            scene, effects = self.cell.scene(with_history(self.data)), self.cell.effects
+            scene, effects = self.cell.pose_arm(add_history_columns(self.data)), self.cell.effects
             for term in maps:
                 at = effects.terms.index(term)
                 own = effects.values[at]
                 first = len(self.covariance) - sum(map(len, effects.values[at:]))
                 part = slice(first, first + len(own))
 
-                each = term.columns(scene).turn[:, joint_of(term.place)]
+                each = term.columns(scene).turn[:, joint_index_from_place(term.place)]
                 sigma = ((np.nan_to_num(self.covariance[part, part]) @ each) * each).sum(axis=0)
                 sizes = rms(own @ each), float(np.sqrt(sigma.mean()))
-                rows.append((f"{name_effect(*term.key)}, RMS", "rad", *sizes, ""))
-        plain = table_of_effects(p for p in self.parameters if not p.name.startswith(labels))
-        return plain.plus(*rows)
+                rows.append((f"{format_effect(*term.key)}, RMS", "rad", *sizes, ""))
+        plain = effect_parameter_table(p for p in self.parameters if not p.name.startswith(labels))
+        return plain.with_rows(*rows)
 
     def sentences(self) -> tuple[str, ...]:
         """The result: what went wrong if anything, inside, set aside, outside, identified."""
@@ -562,12 +619,16 @@ class Fit(Result):
         count, identified = len(self.parameters), sum(p.identifiable for p in self.parameters)
         rest = ", the others stay nominal" if identified < count else ""
         advice = "" if self.reason else self.advice
-        who = f"; quadratic programs of the minimax: {self.answerers()}" if self.answered else ""
+        who = (
+            f"; quadratic programs of the minimax: {self.describe_qp_backends()}"
+            if self.answered
+            else ""
+        )
         every = (
-            f"{capitalise(self.reason)}." if self.reason else "",
+            f"{capitalise_sentence(self.reason)}." if self.reason else "",
             f"RMS error {before.rms_mm:.3f} mm -> {after.rms_mm:.3f} mm, largest "
             f"{before.max_mm:.3f} mm -> {after.max_mm:.3f} mm, on {where}.",
-            self.aside_sentence() if self.set_aside else "",
+            self.describe_points_set_aside() if self.set_aside else "",
             self.beyond.sentence(),
             f"{identified} of {count} parameters identified{rest}; {self.status}{who}.",
             f"{advice}." if advice else "",
@@ -578,157 +639,181 @@ class Fit(Result):
         """The result in a few sentences."""
         return " ".join(self.sentences())
 
-    def solution(self) -> str:
+    def describe_solution(self) -> str:
         """How the fit was found: what its facts say, and who answered the QPs."""
-        facts, work = f"{capitalise(facts_in_words(self))}.", self.work
+        facts, work = f"{capitalise_sentence(format_record_fields(self))}.", self.work
         if not self.answered:
             return facts
         steps = f"{work.steps} steps of least squares ({work.least_squares})"
-        return f"{facts} QPs: {self.answerers()} ({work.warm_starts} warm-started), after {steps}."
+        return (
+            f"{facts} QPs: {self.describe_qp_backends()} "
+            f"({work.warm_starts} warm-started), after {steps}."
+        )
 
-    def answerers(self) -> str:
+    def describe_qp_backends(self) -> str:
         """Backends with the number of QPs they answered, and how rough the answers were."""
-        who = list_counts(self.answered)
+        who = format_counts(self.answered)
         residual = self.work.qp_residual
-        if residual > ROUGH:
+        if residual > MAX_SILENT_QP_RESIDUAL:
             who += f" (used as they are, relative residual up to {residual:.1g})"
         return who
 
-    def aside_sentence(self) -> str:
+    def describe_points_set_aside(self) -> str:
         """How many points were set aside, by whom, and the error with them."""
-        return aside_sentence(self.set_aside, self.with_them)
+        return describe_points_set_aside(self.set_aside, self.with_them)
 
     def tables(self) -> tuple[Table, ...]:
         """Every table of the result."""
         worst = None if self.objective == "point" else self.minimax
-        return filled(
-            self.accuracy_table(), self.interval_table(), self.beyond.table(),
-            *(one.table() for one in (worst, self.certificate) if one), *tables_of(self.frames),
-            self.effect_table(), table_of(self.suspects, self.data), self.parameter_table(),
-        )  # fmt: skip
+        return drop_empty_tables(
+            self.accuracy_table(),
+            self.interval_table(),
+            self.beyond.table(),
+            *(one.table() for one in (worst, self.certificate) if one),
+            *build_cell_frame_tables(self.frames),
+            self.effect_table(),
+            outlier_table(self.suspects, self.data),
+            self.parameter_table(),
+        )
 
     def summary(self, width: int = 110) -> str:
         """The result as plain text."""
-        return f"{super().summary(width)}\n\n{self.solution()}"
+        return f"{super().summary(width)}\n\n{self.describe_solution()}"
 
     # ---- its file ------------------------------------------------------------------------------
 
-    def beside(self, *, poses: bool = True) -> dict[str, Any]:
+    def extra_file_content(self, *, with_measurements: bool = True) -> dict[str, Any]:
         """The arms, the accuracies and, in SI, what later work rests on.
 
-        poses: whether with the measurements, which of many poses are nearly all of it.
+        with_measurements: whether with the measurements, which of many poses are nearly all of it.
         """
-        kept = self.kept.whole()
+        kept = self.usable_cell.whole()
         cell: dict[str, Any] = {"effects": kept.pop("effects")}
-        cell = cell if self.kept is self.cell else self.cell.whole()
+        cell = cell if self.usable_cell is self.cell else self.cell.whole()
         crossed = self.error_crossed.size
         arrays = {
             "singular": self.identification.singular,
             "sensitivity": self.identification.scale,
             "prior": self.prior,
-            **({"share": self.share} if poses or self.share.ndim == 1 else {}),
-            **({"weights": self.weights} if poses else {}),
+            **({"share": self.share} if with_measurements or self.share.ndim == 1 else {}),
+            **({"weights": self.weights} if with_measurements else {}),
             **({"crossed": np.swapaxes(self.error_crossed, 0, 1),  # files have targets first
                 "drawn crossed": np.swapaxes(self.error_drawn_crossed, 0, 1)}
-               if poses and crossed else {}),
+               if with_measurements and crossed else {}),
         }  # fmt: skip
         errors = {"nominal": self.error_nominal, "final": self.error}
         new = self.within
-        judged = in_file(with_ends(new.after, new.rms, new.largest))
+        judged = record_to_file_values(with_intervals(new.after, new.rms, new.largest))
         judged |= {"not_judged": self.unjudged, "nominal": new.before}
-        told = poses and self.data.poses
+        told = with_measurements and self.data.poses
         return {
             **kept,
             "cell": cell,
             "nominal_robot": self.nominal.robot,
             "nominal_cell": self.nominal,
             "frames": self.frames,
-            "frames_convention": CONVENTION,
+            "frames_convention": ABC_ANGLES_CONVENTION,
             "parameters": self.parameters.every,
             "accuracy": {
-                **{key: with_ends(seen, *self.intervals[key]) if key in self.intervals else seen
-                   for key, seen in self.accuracy.items()},
+                **{
+                    key: with_intervals(seen, *self.intervals[key])
+                    if key in self.intervals
+                    else seen
+                    for key, seen in self.accuracy.items()
+                },
                 "holdout_trusted": self.trusted,
                 "beyond": self.beyond,
                 **({"cv": judged} if crossed else {}),
             },
             "covariance": self.uncertainty,
             "arrays": arrays,
-            **({"poses": pose_rows(self.data, self.held, errors)} if told else {}),
-        }  # fmt: skip
+            **({"poses": build_pose_records(self.data, self.held, errors)} if told else {}),
+        }
 
     @classmethod
-    def told_beside(
-        cls, content: Mapping[str, Any], told: Mapping[str, Any], source: str
+    def parse_extra_fields(
+        cls, content: Mapping[str, Any], parsed_fields: Mapping[str, Any], source: str
     ) -> dict[str, Any]:
         """The arms, the poses and what later work rests on, from a file."""
-        read_options(told["provenance"].settings)  # what later work rests on
+        read_options(parsed_fields["provenance"].settings)  # what later work rests on
         cell = cell_from_dict(content, source)
         drawn = {"robot": content["nominal_robot"], **content["nominal_cell"]}
         nominal = cell_from_dict(drawn, f"{source}: nominal_cell")
-        data, held, errors = measured_poses(content, source, cell, "nominal")
+        data, held, errors = parse_measured_poses(content, source, cell, "nominal")
         known = uncertainty_from_dict(content, cell, source)
-        every = as_kind(tuple[Parameter, ...], content["parameters"], Fact(), "parameters")
+        every = parse_as_type(
+            tuple[Parameter, ...], content["parameters"], FieldFormat(), "parameters"
+        )
         parameters = Parameters(every, known.dof)
-        names = Names.of(cell.robot, cell.target_names, tuple(p.name for p in every if p.of_effect))
-        if missing := set(names.all) - set(parameters.names):
+        names = ParameterNames.for_robot(
+            cell.robot, cell.target_names, tuple(p.name for p in every if p.is_of_effect)
+        )
+        if missing := set(names.all_names) - set(parameters.names):
             raise ValueError(f"parameters: {min(missing)} is missing, of {len(missing)}")
         scores = content["accuracy"]
-        beyond = read(Beyond, scores["beyond"], "accuracy.beyond")
-        keys = [*HELD, *(["holdout_with_them"] if scores.get("holdout_with_them") else [])]
-        accuracies = {key: read(Accuracy, scores.get(key), f"accuracy.{key}") for key in keys}
+        beyond = parse_record(RegionHoldout, scores["beyond"], "accuracy.beyond")
+        keys = [
+            *IS_HELD_BY_KEY,
+            *(["holdout_with_them"] if scores.get("holdout_with_them") else []),
+        ]
+        accuracies = {
+            key: parse_record(Accuracy, scores.get(key), f"accuracy.{key}") for key in keys
+        }
         target_count = len(cell.target_names)
         for key, seen in accuracies.items():
             if not len(seen.sse_mm2) == len(seen.counts) == target_count:
                 raise ValueError(f"accuracy.{key} is not of {target_count} targets")
-        arrays = {name: array(value, name) for name, value in content["arrays"].items()}
-        check_shapes(arrays, names.count, data.take(~held), data)
+        arrays = {name: parse_array(value, name) for name, value in content["arrays"].items()}
+        check_array_shapes(arrays, names.parameter_count, data.take(~held), data)
         crossed, drawn_crossed = (
-            np.swapaxes(arrays.get(name, NOT_CROSSED), 0, 1)
+            np.swapaxes(arrays.get(name, NO_CROSS_VALIDATED_ERRORS), 0, 1)
             for name in ("crossed", "drawn crossed")
         )
-        kept = told["status"].keeps_drawn or not cell.effects.causes
-        active = np.zeros(names.count, dtype=bool)
-        active[[names.index(p.name) for p in every]] = [p.identifiable for p in every]
-        reasons = {p.name: p.why for p in every if p.reason}
+        kept = parsed_fields["status"].keeps_drawn or not cell.effects.cause_terms
+        active = np.zeros(names.parameter_count, dtype=bool)
+        active[[names.index_of_name(p.name) for p in every]] = [p.identifiable for p in every]
+        reasons = {p.name: p.reason_record for p in every if p.reason}
         return {
             "cell": cell,
             "nominal": nominal,
             "parameters": parameters,
             "accuracy": accuracies,
-            "claim": Later(lambda: beyond),
+            "claim": LazyValue(lambda: beyond),
             "identification": Identification(
                 active, reasons, arrays["singular"], arrays["sensitivity"]
             ),
             "uncertainty": known,
-            "data": replace(data, digest=told["provenance"].data_sha256),
+            "data": replace(data, digest=parsed_fields["provenance"].data_sha256),
             "held": held,
-            "error_nominal": errors_of(nominal, data, errors[0]),
-            "error": errors_of(cell, data, errors[1]),
+            "error_nominal": compute_or_restore_errors(nominal, data, errors[0]),
+            "error": compute_or_restore_errors(cell, data, errors[1]),
             "weights": arrays.get("weights", data.take(~held).seen.T.astype(float)),
             "share": arrays.get("share", np.ones(len(cell.target_names))),
             "prior": arrays["prior"],
-            "error_crossed": crossed if data.poses else NOT_CROSSED,
+            "error_crossed": crossed if data.poses else NO_CROSS_VALIDATED_ERRORS,
             "error_drawn_crossed": drawn_crossed,
             "stated_geometric": None if kept else cell_from_dict({**content, "cell": {}}, source),
         }
 
 
-def check_shapes(
-    arrays: Mapping[str, Array], count: int, train: Measurements, data: Measurements
+def check_array_shapes(
+    arrays: Mapping[str, Array],
+    parameter_count: int,
+    training_data: Measurements,
+    data: Measurements,
 ) -> None:
     """Raise ValueError for arrays that are not of these parameters and poses."""
-    k, m = len(data.target_names), train.poses
+    k, m = len(data.target_names), training_data.poses
     every = (k, data.poses, 3)
     shapes: dict[str, tuple[tuple[int, ...], ...]] = {
-        "sensitivity": ((count,),), "prior": ((count,),), "weights": ((k, m),),
+        "sensitivity": ((parameter_count,),), "prior": ((parameter_count,),), "weights": ((k, m),),
         "share": ((k,), (k, m)), "crossed": (every,), "drawn crossed": (every,)
     }  # fmt: skip
     if arrays["singular"].ndim != 1 or not arrays["singular"].size:
         raise ValueError("singular is not a row of numbers")
     for name, values in arrays.items():
         known = shapes.get(name, (values.shape,))
-        asked = data.poses or name not in POSE_BY_POSE
+        asked = data.poses or name not in POSE_ARRAY_NAMES
         if values.shape not in known and asked:
             raise ValueError(f"{name} is not of these parameters and poses")
 
@@ -762,9 +847,11 @@ def load_fit(path: Fit | Path | str) -> Fit | RelativeCalibration:
     """
     if isinstance(path, Fit):
         return path
-    content = saved_content(path)
+    content = read_saved_json(path)
     if "measured" in content and content.get("kind") != Fit.KIND:
-        from minimax_cal.fitting.several.result import read_result  # it knows this file
+        from minimax_cal.fitting.multi_instrument.relative_result import (
+            read_result,
+        )  # it knows this file
 
         return read_result(content, str(path))
     return Fit.from_dict(content, str(path))

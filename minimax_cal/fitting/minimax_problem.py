@@ -19,24 +19,29 @@ from typing import Annotated
 
 import numpy as np
 
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.facts import Fact, derived
-from minimax_cal.ground.tables import Table
+from minimax_cal.core.arrays import Array
+from minimax_cal.core.errors import OptionError
+from minimax_cal.core.record_fields import FieldFormat, derived_field
+from minimax_cal.core.tables import Table
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.modelling.model import Model, moved
-from minimax_cal.modelling.parameters import State
-from minimax_cal.solvers.dual_bound import Rows, gap_of, lower_bound, of_squares
+from minimax_cal.modelling.parameters import ParameterValues
+from minimax_cal.modelling.point_model import PointModel, apply_active_step
+from minimax_cal.solvers.dual_bound import (
+    LinearisedNorms,
+    convert_squared_norm_multipliers,
+    dual_lower_bound,
+    relative_duality_gap,
+)
 from minimax_cal.solvers.linearisation import Kkt, Linearisation, measure_kkt
 from minimax_cal.solvers.minimax import Optimum
 
 DISTANCE_FORMS = ("two-sided", "squared", "off")
 MIN_TRUSTED_WEIGHT = 0.5  # a point of less weight tells no distance between targets
-LEAST_TOLERANCE = 1e-6  # a distance is never asked to hold better than a micrometre [m]
+MIN_DISTANCE_TOLERANCE = 1e-6  # a distance is never asked to hold better than a micrometre [m]
 
 
 @dataclass(frozen=True, eq=False)
-class Distances:
+class TargetDistanceLimits:
     """What the instrument says about the distances between targets [paper M, eq. 8].
 
     pairs: (l, 2) indices of targets measured together.  mean: (l,) mean measured distance [m].
@@ -48,7 +53,7 @@ class Distances:
     tolerance: Array
 
 
-def measured_distances(data: Measurements, tolerance: float | None = None) -> Distances:
+def measured_distances(data: Measurements, tolerance: float | None = None) -> TargetDistanceLimits:
     """The distances of all pairs measured together three times or more, and how well known.
 
     tolerance: for all pairs [m].  None takes the instrument's own accuracy: sqrt(2) times the
@@ -68,14 +73,16 @@ def measured_distances(data: Measurements, tolerance: float | None = None) -> Di
         scatter = np.full(len(pairs), np.sqrt(2.0) * float(np.nanmedian(data.columns["u95"])))
     if tolerance is not None:
         scatter = np.full(len(pairs), tolerance)
-    return Distances(
+    return TargetDistanceLimits(
         np.array(pairs, dtype=int).reshape(-1, 2),
         np.array(mean),
-        np.maximum(scatter, LEAST_TOLERANCE),
+        np.maximum(scatter, MIN_DISTANCE_TOLERANCE),
     )
 
 
-def trusted_distances(data: Measurements, weights: Array, tolerance: float | None) -> Distances:
+def trusted_distances(
+    data: Measurements, weights: Array, tolerance: float | None
+) -> TargetDistanceLimits:
     """`measured_distances` of the points that a fit gave weight.  weights: (k, m)."""
     trusted = np.where(weights.T[..., None] > MIN_TRUSTED_WEIGHT, data.y, np.nan)
     return measured_distances(data.with_y(trusted), tolerance)
@@ -93,10 +100,10 @@ class MinimaxProblem:
     """
 
     per: str
-    model: Model
-    distances: Distances
-    start: State
-    first: Sensitivity
+    model: PointModel
+    distances: TargetDistanceLimits
+    start: ParameterValues
+    first: ErrorDerivatives
     scale: Array
     size: float
     form: str
@@ -106,55 +113,63 @@ class MinimaxProblem:
         """Lower bounds of the scaled distance deviations, and of the effects' parameters."""
         count = len(self.distances.mean)
         least = np.full(count, -1.0 if self.form == "two-sided" else -np.inf)
-        return np.concatenate([least, self.room[:, 0]])
+        return np.concatenate([least, self.scaled_parameter_bounds[:, 0]])
 
     @cached_property
     def upper(self) -> Array:
         """Upper bounds of the same."""
-        return np.concatenate([np.ones(len(self.distances.mean)), self.room[:, 1]])
+        return np.concatenate(
+            [np.ones(len(self.distances.mean)), self.scaled_parameter_bounds[:, 1]]
+        )
 
     @cached_property
-    def held(self) -> Array:
+    def bounded_parameters(self) -> Array:
         """(b,) the free parameters, by their place among these, that have bounds."""
         model = self.model
-        ends = np.full((model.names.count, 2), np.inf) * [-1.0, 1.0]
+        ends = np.full((model.names.parameter_count, 2), np.inf) * [-1.0, 1.0]
         if len(model.room):
-            ends[model.names.geometric :] = model.room
+            ends[model.names.geometric_count :] = model.room
         return np.flatnonzero(np.isfinite(ends[model.active]).any(axis=1))
 
     @cached_property
-    def room(self) -> Array:
+    def scaled_parameter_bounds(self) -> Array:
         """(b, 2) their bounds, scaled."""
-        if not len(self.held):
+        if not len(self.bounded_parameters):
             return np.zeros((0, 2))
-        which = np.flatnonzero(self.model.active)[self.held] - self.model.names.geometric
-        return np.asarray(self.model.room[which] * self.scale[self.held, None])
+        which = (
+            np.flatnonzero(self.model.active)[self.bounded_parameters]
+            - self.model.names.geometric_count
+        )
+        return np.asarray(self.model.room[which] * self.scale[self.bounded_parameters, None])
 
     @cached_property
-    def divisor(self) -> Array:
+    def curvature_scale(self) -> Array:
         """(free, free) of a curvature, one an entry: a quotient is as symmetric as what it was."""
         return np.asarray(self.size * np.outer(self.scale, self.scale))
 
     @cached_property
-    def columns(self) -> Array:
+    def target_columns(self) -> Array:
         """(2, l, 3) the parameters of both targets of each pair."""
         first = 5 * self.model.names.joints + 6
         return first + 3 * self.distances.pairs.T[..., None] + np.arange(3)
 
-    def deviation(self, x: State) -> tuple[Array, Array]:
+    def constraint_values_and_jacobian(self, x: ParameterValues) -> tuple[Array, Array]:
         """Model minus measured distance, over the tolerance: (l,), and its derivative (l, p).
 
         Below them the parameters that have bounds, scaled.
         """
-        apart, jacobian = self.distance(x)
-        if not len(self.held):
+        apart, jacobian = self.distance_values_and_jacobian(x)
+        if not len(self.bounded_parameters):
             return apart, jacobian
-        value = self.model.values(x)[self.model.active][self.held] * self.scale[self.held]
-        own = np.eye(len(self.scale))[self.held]
+        value = (
+            self.model.parameter_vector(x)[self.model.active][self.bounded_parameters]
+            * self.scale[self.bounded_parameters]
+        )
+        own = np.eye(len(self.scale))[self.bounded_parameters]
         return np.concatenate([apart, value]), np.concatenate([jacobian, own])
 
-    def distance(self, x: State) -> tuple[Array, Array]:
-        """The part of `deviation` that is about distances."""
+    def distance_values_and_jacobian(self, x: ParameterValues) -> tuple[Array, Array]:
+        """The part of `constraint_values_and_jacobian` that is about distances."""
         kept = self.distances
         count = len(kept.mean)
         if not count:
@@ -162,35 +177,37 @@ class MinimaxProblem:
         between = x.target_positions[kept.pairs[:, 0]] - x.target_positions[kept.pairs[:, 1]]
         length = np.maximum(np.sqrt((between * between).sum(axis=1)), 1e-12)
         c = (length - kept.mean) / kept.tolerance
-        jacobian = np.zeros((count, self.model.names.count))
+        jacobian = np.zeros((count, self.model.names.parameter_count))
         unit = between / (length * kept.tolerance)[:, None]
-        jacobian[np.arange(count)[:, None], self.columns[0]] = unit
-        jacobian[np.arange(count)[:, None], self.columns[1]] = -unit
+        jacobian[np.arange(count)[:, None], self.target_columns[0]] = unit
+        jacobian[np.arange(count)[:, None], self.target_columns[1]] = -unit
         if self.form == "squared":
             jacobian, c = 2.0 * c[:, None] * jacobian, c**2
         return c, jacobian[:, self.model.active] / self.scale
 
-    def evaluate(self, x: State) -> tuple[Array, Array]:
+    def evaluate(self, x: ParameterValues) -> tuple[Array, Array]:
         """f and c."""
-        value, _ = PER[self.per]
-        return (value(self.model, x) + prior_of(self.model, x)) / self.size, self.deviation(x)[0]
+        value, _ = ERROR_FUNCTIONS[self.per]
+        return (
+            value(self.model, x) + prior_cost_per_point(self.model, x)
+        ) / self.size, self.constraint_values_and_jacobian(x)[0]
 
-    def linearise(self, x: State) -> Linearisation:
+    def linearise(self, x: ParameterValues) -> Linearisation:
         """f, c and their derivatives; the curvature is Gauss-Newton's 2 J'J."""
         model = self.model
-        at = self.first if x is self.start else PER[self.per][1](model, x)
+        at = self.first if x is self.start else ERROR_FUNCTIONS[self.per][1](model, x)
         slope, held, known = at.jacobian, 0.0, bool(model.prior.weight.any())
         if known:
-            total, weight = model.counts.sum(), model.prior.weight[model.active]
-            off = (model.prior.mean - model.values(x))[model.active]
-            slope, held = slope - 2.0 * weight * off / total, prior_of(model, x)
-        c, normal = self.deviation(x)
+            total, weight = model.pose_counts_by_target.sum(), model.prior.weight[model.active]
+            off = (model.prior.mean - model.parameter_vector(x))[model.active]
+            slope, held = slope - 2.0 * weight * off / total, prior_cost_per_point(model, x)
+        c, normal = self.constraint_values_and_jacobian(x)
 
         def curvature(weights: Array) -> Array:
             both = at.curvature(weights)
             if known:
                 both = both + 2.0 * weights.sum() * np.diag(weight) / total
-            return np.asarray(both / self.divisor)
+            return np.asarray(both / self.curvature_scale)
 
         return Linearisation(
             f=(at.f + held) / self.size,
@@ -200,13 +217,13 @@ class MinimaxProblem:
             curvature=curvature,
         )
 
-    def step(self, x: State, d: Array) -> State:
+    def step(self, x: ParameterValues, d: Array) -> ParameterValues:
         """The state moved by a scaled step in the free parameters."""
-        return moved(self.model, x, d / self.scale)
+        return apply_active_step(self.model, x, d / self.scale)
 
 
 @dataclass(frozen=True, eq=False)
-class Sensitivity:
+class ErrorDerivatives:
     """f (n,) [m^2], its derivative (n, free), and the weighted sum of its curvatures."""
 
     f: Array
@@ -214,81 +231,90 @@ class Sensitivity:
     curvature: Callable[[Array], Array]
 
 
-def prior_of(model: Model, x: State) -> float:
+def prior_cost_per_point(model: PointModel, x: ParameterValues) -> float:
     """The prior's part of every f_i: the share it has in a mean square [m^2]."""
     if not model.prior.weight.any():
         return 0.0
-    off = model.prior.mean - model.values(x)
-    return float((model.prior.weight * off**2).sum() / model.counts.sum())
+    off = model.prior.mean - model.parameter_vector(x)
+    return float((model.prior.weight * off**2).sum() / model.pose_counts_by_target.sum())
 
 
-def target_values(model: Model, x: State) -> Array:
+def target_mean_squares(model: PointModel, x: ParameterValues) -> Array:
     """F_i / m_i of every target: (k,) [m^2]."""
-    return np.asarray(model.cost(x) / model.counts)
+    return np.asarray(model.target_costs(x) / model.pose_counts_by_target)
 
 
-def target_sensitivity(model: Model, x: State) -> Sensitivity:
+def target_derivatives(model: PointModel, x: ParameterValues) -> ErrorDerivatives:
     """F_i / m_i and its derivatives."""
-    normal = model.normal(x, model.active)
-    counts = model.counts
-    return Sensitivity(
+    normal = model.normal_equations(x, model.active)
+    counts = model.pose_counts_by_target
+    return ErrorDerivatives(
         normal.cost / counts,
         -2.0 * normal.gradient / counts[:, None],
         lambda weights: 2.0 * np.tensordot(weights / counts, normal.gram, 1),
     )
 
 
-def point_values(model: Model, x: State) -> Array:
+def point_squares(model: PointModel, x: ParameterValues) -> Array:
     """The squared distance of every measured point, target by target: (points,) [m^2]."""
-    parts = [(model.error_of(x, block)[0] ** 2).sum(axis=-2) for block in model.blocks(x)]
-    return np.asarray(np.concatenate(parts, axis=-1)[model.seen])
+    parts = [
+        (model.block_errors_and_points(x, block)[0] ** 2).sum(axis=-2)
+        for block in model.split_into_blocks(x)
+    ]
+    return np.asarray(np.concatenate(parts, axis=-1)[model.measured_mask])
 
 
-def point_sensitivity(model: Model, x: State) -> Sensitivity:
+def point_derivatives(model: PointModel, x: ParameterValues) -> ErrorDerivatives:
     """Squared distances and their derivatives."""
-    f, jacobian = model.squares(x)
+    f, jacobian = model.squared_distances_and_gradients(x)
 
     def curvature(weights: Array) -> Array:
-        share = np.zeros(model.seen.shape)
-        share[model.seen] = weights
-        return 2.0 * model.gram(x, model.weight * share)
+        share = np.zeros(model.measured_mask.shape)
+        share[model.measured_mask] = weights
+        return 2.0 * model.weighted_gram(x, model.weight * share)
 
-    return Sensitivity(f[model.seen], jacobian[model.seen], curvature)
+    return ErrorDerivatives(f[model.measured_mask], jacobian[model.measured_mask], curvature)
 
 
-PER = {
-    "target": (target_values, target_sensitivity),
-    "point": (point_values, point_sensitivity),
+ERROR_FUNCTIONS = {
+    "target": (target_mean_squares, target_derivatives),
+    "point": (point_squares, point_derivatives),
 }
 
 
-def minimax_problem(
-    model: Model, start: State, distances: Distances, form: str, per: str
+def build_minimax_problem(
+    model: PointModel,
+    start: ParameterValues,
+    distances: TargetDistanceLimits,
+    distance_form: str,
+    function_kind: str,
 ) -> MinimaxProblem:
     """The minimax problem scaled at a start.  Raises OptionError for an unknown form."""
-    if form not in DISTANCE_FORMS:
-        raise OptionError(f"distance form {form!r}; choose {', '.join(DISTANCE_FORMS)}")
-    if form == "off":
+    if distance_form not in DISTANCE_FORMS:
+        raise OptionError(f"distance form {distance_form!r}; choose {', '.join(DISTANCE_FORMS)}")
+    if distance_form == "off":
         none = np.zeros(0)
-        distances = Distances(np.zeros((0, 2), dtype=int), none, none)
-    first = PER[per][1](model, start)
+        distances = TargetDistanceLimits(np.zeros((0, 2), dtype=int), none, none)
+    first = ERROR_FUNCTIONS[function_kind][1](model, start)
     size = float(first.f.max())
     size = size if size > 0.0 else 1e-18
     mean = first.curvature(np.full(len(first.f), 1.0 / len(first.f)))
-    known = model.prior.weight[model.active] / model.counts.sum()
+    known = model.prior.weight[model.active] / model.pose_counts_by_target.sum()
     scale = np.sqrt(np.maximum((np.diag(mean) + 2.0 * known) / size, 1e-30))
-    return MinimaxProblem(per, model, distances, start, first, scale, size, form)
+    return MinimaxProblem(function_kind, model, distances, start, first, scale, size, distance_form)
 
 
 # ---- the certificate -----------------------------------------------------------------------------
 
 
-RIDGE = 1e-12  # of the mean curvature, about one: directions without any stay finite
-ACTIVE = 1e-6  # relative: nearer to the largest than this counts as equal to it
+MIN_RELATIVE_CURVATURE = (
+    1e-12  # of the mean curvature, about one: directions without any stay finite
+)
+MAX_ACTIVE_NORM_GAP = 1e-6  # relative: nearer to the largest than this counts as equal to it
 
 
 @dataclass(frozen=True, eq=False)
-class PointCones:
+class PointConeProblem:
     """The problem `worst` (of points) in the norms themselves.
 
     white: (free, free) from a whitened step to one scaled as in `worst`.
@@ -298,12 +324,12 @@ class PointCones:
     white: Array
 
     @staticmethod
-    def of(worst: MinimaxProblem) -> PointCones:
+    def whiten(worst: MinimaxProblem) -> PointConeProblem:
         """Whitened where the problem was scaled."""
         count = len(worst.first.f)
         mean = 0.5 * worst.linearise(worst.start).curvature(np.full(count, 1.0 / count))
-        factor = np.linalg.cholesky(mean + RIDGE * np.eye(len(mean)))
-        return PointCones(worst, np.linalg.inv(factor).T)
+        factor = np.linalg.cholesky(mean + MIN_RELATIVE_CURVATURE * np.eye(len(mean)))
+        return PointConeProblem(worst, np.linalg.inv(factor).T)
 
     @property
     def lower(self) -> Array:
@@ -315,30 +341,35 @@ class PointCones:
         """Upper bounds of the scaled distance deviations."""
         return self.worst.upper
 
-    def linearise(self, x: State) -> Rows:
+    def linearise(self, x: ParameterValues) -> LinearisedNorms:
         """Weighted errors of the points, target by target, distances, and their derivatives."""
         model, size = self.worst.model, np.sqrt(self.worst.size)
-        rows = [model.weighted_rows(x, block, model.active) for block in model.blocks(x)]
+        rows = [
+            model.block_errors_and_jacobian(x, block, model.active)
+            for block in model.split_into_blocks(x)
+        ]
         error = np.concatenate([part for part, _ in rows], axis=-1)
         turned = np.concatenate([part for _, part in rows], axis=-1)
-        r = np.moveaxis(error, 1, 2)[model.seen]
-        J = -np.moveaxis(turned, (1, 2), (3, 2))[model.seen]
-        known, jacobian = self.prior(x)
+        r = np.moveaxis(error, 1, 2)[model.measured_mask]
+        J = -np.moveaxis(turned, (1, 2), (3, 2))[model.measured_mask]
+        known, jacobian = self.prior_rows(x)
         r = np.concatenate([r, np.broadcast_to(known, (len(r), len(known)))], axis=1)
         J = np.concatenate([J, np.broadcast_to(jacobian, (len(J), *jacobian.shape))], axis=1)
-        c, normal = self.worst.deviation(x)
+        c, normal = self.worst.constraint_values_and_jacobian(x)
         J = J @ (self.white / self.worst.scale[:, None])
-        return Rows(r / size, J / size, c, normal @ self.white)
+        return LinearisedNorms(r / size, J / size, c, normal @ self.white)
 
-    def prior(self, x: State) -> tuple[Array, Array]:
+    def prior_rows(self, x: ParameterValues) -> tuple[Array, Array]:
         """What the prior adds to every point's vector: (e,) and its derivative (e, free) [m]."""
         model = self.worst.model
         chosen = model.prior.weight > 0.0
-        root = np.sqrt(model.prior.weight[chosen] / model.counts.sum())
-        jacobian = -root[:, None] * np.eye(model.names.count)[np.ix_(chosen, model.active)]
-        return root * (model.prior.mean - model.values(x))[chosen], jacobian
+        root = np.sqrt(model.prior.weight[chosen] / model.pose_counts_by_target.sum())
+        jacobian = (
+            -root[:, None] * np.eye(model.names.parameter_count)[np.ix_(chosen, model.active)]
+        )
+        return root * (model.prior.mean - model.parameter_vector(x))[chosen], jacobian
 
-    def step(self, x: State, d: Array) -> State:
+    def step(self, x: ParameterValues, d: Array) -> ParameterValues:
         """The state moved by a whitened step."""
         return self.worst.step(x, self.white @ d)
 
@@ -349,7 +380,7 @@ class DecidingPoint:
 
     target: str
     line: int
-    distance: Annotated[float, Fact(key="distance_mm", scale=1e3)]
+    distance: Annotated[float, FieldFormat(key="distance_mm", scale=1e3)]
     multiplier: float
 
 
@@ -362,19 +393,19 @@ class Certificate:
     multipliers alone [m].  The problem itself is not convex: this is no statement about far ones,
     and near ones may be better by second-order terms, the size of the curvature times the step
     squared.
-    kkt: residuals of the measure_kkt conditions, of the problem scaled to about one.
+    kkt: residuals of the KKT conditions, of the problem scaled to about one.
     points: that decide, the weightiest first; the multipliers sum to one over all points.
     """
 
-    value: Annotated[float, Fact(key="value_mm", scale=1e3)]
-    bound: Annotated[float, Fact(key="bound_mm", scale=1e3)]
+    value: Annotated[float, FieldFormat(key="value_mm", scale=1e3)]
+    bound: Annotated[float, FieldFormat(key="bound_mm", scale=1e3)]
     kkt: Kkt
     points: tuple[DecidingPoint, ...]
 
-    @derived()
+    @derived_field()
     def gap(self) -> float:
         """How much smaller the largest distance could be at most, to first order, relative."""
-        return gap_of(self.value, self.bound)
+        return relative_duality_gap(self.value, self.bound)
 
     def table(self) -> Table:
         """The points that decide."""
@@ -383,35 +414,39 @@ class Certificate:
             f"{1e3 * self.bound:.4f} mm (gap {self.gap:.1e})"
         )
         columns = "target | line d | distance=distance mm .4f | multiplier .4f"
-        return Table.of(title, self.points, columns)
+        return Table.from_records(title, self.points, columns)
 
 
-def certify(problem: MinimaxProblem, best: Optimum[State], line: Array) -> Certificate:
+def build_certificate(
+    problem: MinimaxProblem, optimum: Optimum[ParameterValues], file_lines: Array
+) -> Certificate:
     """The certificate of an answer of the SQP.
 
-    problem: of points, scaled at any state of the same model.  line: (m,) of the file, pose by
-    pose.
+    problem: of points, scaled at any state of the same model.  file_lines: (m,) of the file, pose
+    by pose.
     """
-    rows = PointCones.of(problem).linearise(best.x)
+    rows = PointConeProblem.whiten(problem).linearise(optimum.x)
     model, norms, size = problem.model, rows.norms, np.sqrt(problem.size)
-    same = float(norms.max()) ** 2 / best.value  # the answer's own scaling may be another
-    given = of_squares(rows, best.mu, best.lam * same)
+    same = float(norms.max()) ** 2 / optimum.value  # the answer's own scaling may be another
+    given = convert_squared_norm_multipliers(rows, optimum.mu, optimum.lam * same)
     mu = np.linalg.norm(given.y, axis=1)
-    chosen = np.flatnonzero((norms >= norms.max() * (1.0 - ACTIVE)) | (mu > ACTIVE))
+    chosen = np.flatnonzero(
+        (norms >= norms.max() * (1.0 - MAX_ACTIVE_NORM_GAP)) | (mu > MAX_ACTIVE_NORM_GAP)
+    )
     chosen = chosen[np.argsort(-mu[chosen], kind="stable")]
-    target, pose = np.argwhere(model.seen)[chosen].T
-    distance = np.linalg.norm(model.error(best.x), axis=-1)  # (m, k)
+    target, pose = np.argwhere(model.measured_mask)[chosen].T
+    distance = np.linalg.norm(model.point_errors(optimum.x), axis=-1)  # (m, k)
     names = (model.names.target_names[i] for i in target)
-    numbers = (part.tolist() for part in (line[pose], distance[pose, target], mu[chosen]))
+    numbers = (part.tolist() for part in (file_lines[pose], distance[pose, target], mu[chosen]))
     return Certificate(
         value=float(size * norms.max()),
-        bound=float(size * lower_bound(rows, problem.lower, problem.upper, given)),
-        kkt=measure_kkt(gradients(rows), mu, given.lam, problem.lower, problem.upper),
+        bound=float(size * dual_lower_bound(rows, problem.lower, problem.upper, given)),
+        kkt=measure_kkt(linearise_norms(rows), mu, given.lam, problem.lower, problem.upper),
         points=tuple(starmap(DecidingPoint, zip(names, *numbers, strict=True))),
     )
 
 
-def gradients(rows: Rows) -> Linearisation:
+def linearise_norms(rows: LinearisedNorms) -> Linearisation:
     """The norms as plain functions; a norm of zero has no gradient."""
     norms = rows.norms
     unit = rows.r / np.where(norms > 0.0, norms, 1.0)[:, None]

@@ -10,35 +10,46 @@ from typing import Literal, TypeVar
 import numpy as np
 
 import qp_backends
-from minimax_cal.fitting import identify
+from minimax_cal.core.arrays import Array
+from minimax_cal.core.errors import OptionError
+from minimax_cal.core.option_fields import option_field_in_group
+from minimax_cal.core.progress_stages import Progress as Progress
+from minimax_cal.core.progress_stages import silent_progress as silent_progress
+from minimax_cal.core.record_fields import FieldFormat, field_type_hints
+from minimax_cal.core.record_parsing import parse_as_type
+from minimax_cal.fitting import identification
 from minimax_cal.fitting.minimax_problem import DISTANCE_FORMS
-from minimax_cal.fitting.robust import LOSSES, SQUARE, check_robust
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.facts import Fact, hints_of
-from minimax_cal.ground.options import grouped
-from minimax_cal.ground.records import as_kind
-from minimax_cal.ground.stages import Progress as Progress
-from minimax_cal.ground.stages import silent as silent
-from minimax_cal.instruments.options import InstrumentOptions
+from minimax_cal.fitting.robust_fit import LOSSES, SQUARE_LOSS, check_loss_and_trim
+from minimax_cal.instruments.instrument_options import InstrumentOptions
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.effects.table import Term
-from minimax_cal.modelling.parameters import Names
+from minimax_cal.modelling.parameters import ParameterNames
 from minimax_cal.robots.kinematics import MDH_NAMES
 from minimax_cal.solvers import minimax
 from minimax_cal.solvers.epigraph_qp import VerifiedQpSolver
-from minimax_cal.solvers.least_squares import AUTO, JOINT, METHODS
-from minimax_cal.solvers.own_qp import QpFunction, adapt_qp_function
+from minimax_cal.solvers.least_squares import (
+    AUTO_METHOD_NAME,
+    JOINT_METHOD_NAME,
+    LEAST_SQUARES_METHODS,
+)
+from minimax_cal.solvers.qp_function import QpFunction, adapt_qp_function
 from qp_backends import BackendError
 from qp_backends import solve as solve_qp
 from qp_backends.registry import BackendName, backend
 
-SEED = Fact(least=0)
-OFFSETS = "offsets"  # what `only` may ask for
-FALLBACK = "daqp"  # a required package
-FUNCTION = "function "  # before the name of a QP solver that is none of the backends
-UNITS = {"mm": 1e-3, "um": 1e-6, "m": 1.0, "mrad": 1e-3, "rad": 1.0, "deg": 0.017453292519943295}
-LENGTHS = ("mm", "um", "m")
+SEED_FORMAT = FieldFormat(least=0)
+ONLY_OFFSETS = "offsets"  # what `only` may ask for
+FALLBACK_QP_BACKEND = "daqp"  # a required package
+QP_FUNCTION_PREFIX = "function "  # before the name of a QP solver that is none of the backends
+PRIOR_UNIT_SCALES = {
+    "mm": 1e-3,
+    "um": 1e-6,
+    "m": 1.0,
+    "mrad": 1e-3,
+    "rad": 1.0,
+    "deg": 0.017453292519943295,
+}
+LENGTH_UNITS = ("mm", "um", "m")
 
 
 Objective = Literal[
@@ -51,35 +62,35 @@ QpChoice = BackendName | QpFunction
 T = TypeVar("T")
 
 
-LOOSE = 3.0  # no arm is so far off its drawing [m, rad]
+MAX_PRIOR_SIGMA = 3.0  # no arm is so far off its drawing [m, rad]
 LEAST_SIGMA, MOST_SIGMA = 1e-12, 1e6  # of a prior that says something [m, rad]
 
 
-def priors_of(given: Mapping[str, float | str] | None) -> dict[str, float]:
+def parse_priors(prior_sigmas: Mapping[str, float | str] | None) -> dict[str, float]:
     """Sigmas of priors in SI, from numbers or texts with a unit.  Raises OptionError."""
-    pairs = (given or {}).items()
-    return dict(prior_of(f"{k}={v}") if isinstance(v, str) else (k, v) for k, v in pairs)
+    pairs = (prior_sigmas or {}).items()
+    return dict(parse_prior(f"{k}={v}") if isinstance(v, str) else (k, v) for k, v in pairs)
 
 
-def prior_of(text: str) -> tuple[str, float]:
+def parse_prior(text: str) -> tuple[str, float]:
     """NAME=SIGMA with its unit, as ``a*=0.5mm`` or ``theta2=1mrad``."""
     name, equals, size = text.partition("=")
     kind = name.rstrip("0123456789*")
-    for unit in sorted(UNITS, key=len, reverse=True):
-        if size.endswith(unit) and kind in MDH_NAMES and (kind in "ad") != (unit in LENGTHS):
+    for unit in sorted(PRIOR_UNIT_SCALES, key=len, reverse=True):
+        if size.endswith(unit) and kind in MDH_NAMES and (kind in "ad") != (unit in LENGTH_UNITS):
             what = "a length: give mm" if kind in "ad" else "an angle: give mrad or deg"
             raise OptionError(f"prior {text!r}: {name} is {what}")
         if equals and name and size.endswith(unit):
             try:
-                return name, float(size.removesuffix(unit)) * UNITS[unit]
+                return name, float(size.removesuffix(unit)) * PRIOR_UNIT_SCALES[unit]
             except ValueError:
                 break
     raise OptionError(f"prior {text!r}: write NAME=SIGMA with a unit, as a*=0.5mm or theta2=1mrad")
 
 
-fitted, solved = grouped("What is fitted"), grouped("How it is solved")
-held_out, known = grouped("What is held out"), grouped("What is known")
-outliers = grouped("Outliers")
+fitted, solved = option_field_in_group("What is fitted"), option_field_in_group("How it is solved")
+held_out, known = option_field_in_group("What is held out"), option_field_in_group("What is known")
+OUTLIER_OPTION_GROUP = option_field_in_group("Outliers")
 
 
 @dataclass(frozen=True)
@@ -149,7 +160,7 @@ class Options:
         "What is known of a parameter: how far it may be from its nominal value, as a*=0.5mm.",
         flag="--prior",
         metavar="NAME=SIGMA",
-        read=prior_of,
+        read=parse_prior,
         many=dict,
     )
     effects: Sequence[str | Term] = fitted(
@@ -159,14 +170,14 @@ class Options:
         many=tuple,
     )
     method: str = solved(
-        AUTO,
+        AUTO_METHOD_NAME,
         "The method of least squares: auto (variable projection, damped where a start is far), "
-        f"joint (all parameters at once, the fastest), {', '.join(METHODS)}.",
+        f"joint (all parameters at once, the fastest), {', '.join(LEAST_SQUARES_METHODS)}.",
     )
-    loss: str = outliers(
-        SQUARE, f"How errors count, against outliers: {', '.join((SQUARE, *LOSSES))}."
+    loss: str = OUTLIER_OPTION_GROUP(
+        SQUARE_LOSS, f"How errors count, against outliers: {', '.join((SQUARE_LOSS, *LOSSES))}."
     )
-    trim: float = outliers(
+    trim: float = OUTLIER_OPTION_GROUP(
         0.0, "Set aside at most this fraction of the points, the largest outliers.", metavar="SHARE"
     )
     hessian: str = solved("gauss-newton", "The Hessian of the minimax: gauss-newton or bfgs.")
@@ -189,35 +200,41 @@ class Options:
         "The points are of a simulation and may be exact; a file with a column simulated says "
         "so itself.",
     )
-    resolution: float = identify.RESOLUTION
+    resolution: float = identification.DEFAULT_RESOLUTION
 
     def settings(self) -> dict[str, object]:
         """For the record, effects in their written form."""
         effects = [e.text if isinstance(e, Term) else e for e in self.effects]
-        return {**vars(self), "effects": effects, "qp": qp_name(self.qp)}
+        return {**vars(self), "effects": effects, "qp": qp_solver_name(self.qp)}
 
 
 def read_options(settings: Mapping[str, object], **given: object) -> Options:
     """The options that a result's file holds, but for those given.  Raises ValueError."""
     texts = dict.fromkeys(("fix", "free", "effects"), tuple[str, ...])
-    kinds = {**hints_of(Options), **texts, "qp": str}  # effects and a QP solver have names there
+    kinds = {
+        **field_type_hints(Options),
+        **texts,
+        "qp": str,
+    }  # effects and a QP solver have names there
     kept: dict[str, object] = {}
     for name in kinds.keys() & settings.keys() - given.keys():
         value, at = settings[name], f"provenance.settings.{name}"
         if value is None and kinds[name] is float:
             raise ValueError(f"{at}: should be a number")
-        kept[name] = as_kind(kinds[name], value, SEED if name == "seed" else Fact(), at)
+        kept[name] = parse_as_type(
+            kinds[name], value, SEED_FORMAT if name == "seed" else FieldFormat(), at
+        )
     return Options(**{**kept, **given})  # type: ignore[arg-type]
 
 
-def listed(names: str | Sequence[T]) -> Sequence[T | str]:
+def split_names(names: str | Sequence[T]) -> Sequence[T | str]:
     """Names from a list, or from one text with commas."""
     if isinstance(names, str):
         return tuple(filter(None, names.replace(" ", "").split(",")))
     return names
 
 
-def objective_of(objective: str, data: Measurements) -> int:
+def parse_objective_target(objective: str, data: Measurements) -> int:
     """Index of the single target of smr:K, else -1.  Raises OptionError."""
     if objective in ("sum", "minimax", "point", "pose"):
         return -1
@@ -237,15 +254,15 @@ def objective_of(objective: str, data: Measurements) -> int:
 def check_options(options: Options) -> None:
     """Raise an error for a choice that does not exist, before any work."""
     for name, value, choices in (
-        ("method", options.method, (AUTO, JOINT, *METHODS)),
-        ("hessian", options.hessian, minimax.HESSIANS),
+        ("method", options.method, (AUTO_METHOD_NAME, JOINT_METHOD_NAME, *LEAST_SQUARES_METHODS)),
+        ("hessian", options.hessian, minimax.HESSIAN_CHOICES),
         ("distance form", options.distance, DISTANCE_FORMS),
     ):
         if value not in choices:
             raise OptionError(f"no {name} {value!r}; choose {', '.join(choices)}")
-    if options.only not in ("", OFFSETS):
-        raise OptionError(f"only {options.only!r}: the only choice is {OFFSETS}")
-    check_robust(options.loss, options.trim)
+    if options.only not in ("", ONLY_OFFSETS):
+        raise OptionError(f"only {options.only!r}: the only choice is {ONLY_OFFSETS}")
+    check_loss_and_trim(options.loss, options.trim)
     check_resolution(options.resolution)
     for name, length in (
         ("lever", options.lever),
@@ -262,30 +279,36 @@ def check_resolution(resolution: float) -> None:
         raise OptionError(f"resolution {resolution:g}: give 0 <= resolution < 1")
 
 
-def freed(names: Names, free: Sequence[str], allowed: Array) -> Array:
+def select_freed_parameters(
+    names: ParameterNames, name_patterns: Sequence[str], is_allowed: Array
+) -> Array:
     """(p,) True for what is to be given up last.  Raises OptionError for what is not allowed (p,).
 
-    free: names or patterns.
+    name_patterns: names or patterns.
     """
-    wanted = names.match(free, "free")
-    if (wanted & ~allowed).any():
-        name = names.all[int(np.argmax(wanted & ~allowed))]
+    wanted = names.match_patterns(name_patterns, "free")
+    if (wanted & ~is_allowed).any():
+        name = names.all_names[int(np.argmax(wanted & ~is_allowed))]
         raise OptionError(f"{name} is both fixed and freed; take it out of fix or free")
     return wanted
 
 
-def known_within(names: Names, priors: Mapping[str, float], others: str) -> Array:
+def prior_sigmas(
+    names: ParameterNames, priors: Mapping[str, float], other_parameters: str
+) -> Array:
     """(p,) sigma of each parameter's prior, infinite where nothing is known.  Raises OptionError.
 
-    priors: sigma by name or pattern [SI], of which one of `LOOSE` or more says nothing.  others:
-    what is no link, in a message.
+    priors: sigma by name or pattern [SI], of which one of `MAX_PRIOR_SIGMA` or more says nothing.
+    other_parameters: what is no link, in a message.
     """
-    sigma = np.full(names.count, np.inf)
+    sigma = np.full(names.parameter_count, np.inf)
     for pattern, value in priors.items():
-        chosen = names.match([pattern], "prior")
-        if (chosen & ~names.links).any():
-            raise OptionError(f"prior {pattern}: {others} have no nominal value to keep to")
-        sigma[chosen] = value if value < LOOSE else np.inf
+        chosen = names.match_patterns([pattern], "prior")
+        if (chosen & ~names.link_mask).any():
+            raise OptionError(
+                f"prior {pattern}: {other_parameters} have no nominal value to keep to"
+            )
+        sigma[chosen] = value if value < MAX_PRIOR_SIGMA else np.inf
     return sigma
 
 
@@ -299,33 +322,35 @@ def check_priors(priors: Mapping[str, float]) -> None:
             raise OptionError(f"prior {pattern}: sigma {sigma:g} says nothing of an arm; {mend}")
 
 
-def qp_name(qp: QpSolver) -> str:
+def qp_solver_name(qp: QpSolver) -> str:
     """What a QP solver is called in results."""
-    return qp if isinstance(qp, str) else f"{FUNCTION}{getattr(qp, '__name__', 'unnamed')}"
+    return (
+        qp if isinstance(qp, str) else f"{QP_FUNCTION_PREFIX}{getattr(qp, '__name__', 'unnamed')}"
+    )
 
 
-def solver_of(qp: QpSolver, tolerance: float) -> tuple[VerifiedQpSolver, tuple[str, ...]]:
+def build_qp_solver(qp: QpSolver, tolerance: float) -> tuple[VerifiedQpSolver, tuple[str, ...]]:
     """The QP solver, and a notice where it is not the one that was named.  Raises OptionError."""
     if not (isinstance(qp, str) or callable(qp)):
         raise OptionError(f"qp={qp!r}: give the name of a backend, or a function")
     if not isinstance(qp, str):
-        return adapt_qp_function(qp, tolerance, qp_name(qp)), ()
-    name, notices = usable(qp)
+        return adapt_qp_function(qp, tolerance, qp_solver_name(qp)), ()
+    name, notices = select_usable_qp_backend(qp)
     return partial(solve_qp, name=name, tolerance=tolerance), notices
 
 
-def usable(qp: str) -> tuple[str, tuple[str, ...]]:
+def select_usable_qp_backend(qp: str) -> tuple[str, tuple[str, ...]]:
     """The QP backend to use, and a notice where it is not the one that was named.
 
     A backend that exists but is not installed is replaced; a name that does not exist is a
     mistake.  Raises OptionError.
     """
-    if qp.startswith(FUNCTION):
-        return FALLBACK, (f"QP: the solver was a {qp}; {FALLBACK} is used",)
+    if qp.startswith(QP_FUNCTION_PREFIX):
+        return FALLBACK_QP_BACKEND, (f"QP: the solver was a {qp}; {FALLBACK_QP_BACKEND} is used",)
     try:
         backend(qp)
     except BackendError as error:
         if qp.partition(":")[0] not in qp_backends.names():
             raise OptionError(str(error)) from error
-        return FALLBACK, (f"QP: {error}; {FALLBACK} is used",)
+        return FALLBACK_QP_BACKEND, (f"QP: {error}; {FALLBACK_QP_BACKEND} is used",)
     return qp, ()

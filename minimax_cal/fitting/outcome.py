@@ -12,14 +12,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from minimax_cal.core.arrays import Array
+from minimax_cal.core.display_text import format_first_names
+from minimax_cal.core.units import display_unit_of_change
 from minimax_cal.fitting.accuracy import Accuracy
-from minimax_cal.fitting.checks import too_changed
-from minimax_cal.fitting.disagreement import Contradiction
-from minimax_cal.fitting.suspects import MIN_POINTS_LEFT
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.units import for_people
-from minimax_cal.ground.words import name_first
-from minimax_cal.modelling.parameters import Names, links_of
+from minimax_cal.fitting.contradiction import Contradiction
+from minimax_cal.fitting.data_slips import describe_other_arm
+from minimax_cal.fitting.outliers import MIN_POINTS_LEFT
+from minimax_cal.modelling.parameters import ParameterNames, flatten_link_parameters
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers.status import Status
 
@@ -140,7 +140,7 @@ def find_another_arm(evidence: FitEvidence) -> str:
     robot, seen = evidence.robot, [a.rms_mm for one in evidence.files for a in one.drawn.values()]
     if evidence.allow_large_changes or max(seen, default=np.inf) < 1e3 * YIELDS * robot.reach():
         return ""
-    return too_changed(robot, evidence.mdh, evidence.active)
+    return describe_other_arm(robot, evidence.mdh, evidence.active)
 
 
 def find_contradictions(evidence: FitEvidence) -> str:
@@ -159,14 +159,15 @@ def find_undetermined_values(evidence: FitEvidence) -> str:
     vague = select_vague_links(robot, evidence.mdh, evidence.active, evidence.sigma, drawn)
     if robot.rough or not vague.any() or not evidence.position_sigma > evidence.drawn_sigma:
         return ""
-    names, times = Names.of(robot, ()), evidence.sigma / drawn
+    names, times = ParameterNames.for_robot(robot, ()), evidence.sigma / drawn
     worst = [i for i in np.argsort(-np.nan_to_num(times)) if vague[i]]
     named = []
     for i in worst:
-        scale, unit = for_people("m" if names.linear[i] else "rad")
-        named.append(f"{names.all[i]} (sigma {scale * evidence.sigma[i]:.3g} {unit})")
+        scale, unit = display_unit_of_change("m" if names.linear_mask[i] else "rad")
+        named.append(f"{names.all_names[i]} (sigma {scale * evidence.sigma[i]:.3g} {unit})")
     return (
-        f"these measurements do not determine {name_first(named, MAX_NAMED)}: positions of the "
+        f"these measurements do not determine "
+        f"{format_first_names(named, MAX_NAMED)}: positions of the "
         f"calibrated arm are known to {1e3 * evidence.position_sigma:.3g} mm, of the drawn one to "
         f"{1e3 * evidence.drawn_sigma:.3g} mm (drawn_within of the robot); the drawn arm is kept; "
         "measure more poses, and directions that are not measured yet, or fix these parameters"
@@ -181,7 +182,7 @@ def select_vague_links(
 
     Arguments as the fields of `FitEvidence`.
     """
-    change = np.abs(links_of(mdh - robot.mdh))
+    change = np.abs(flatten_link_parameters(mdh - robot.mdh))
     with np.errstate(invalid="ignore"):
         return np.asarray(active & (sigma > drawn) & (change < MIN_CHANGE_SIGMAS * sigma))
 

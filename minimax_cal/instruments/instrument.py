@@ -14,33 +14,44 @@ from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
 
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import DataError
-from minimax_cal.instruments.options import InstrumentOptions
+from minimax_cal.core.arrays import Array
+from minimax_cal.core.errors import DataError
+from minimax_cal.instruments.instrument_options import InstrumentOptions
 from minimax_cal.instruments.protocol import FlangePoses, ResidualRows
-from minimax_cal.measuring.grouping import groups, held_out
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.modelling.model import TARGET
-from minimax_cal.reading.rows import Rows
+from minimax_cal.measuring.pose_groups import group_repeated_poses, select_holdout_rows
+from minimax_cal.modelling.point_model import DEFAULT_TARGET_NAME
+from minimax_cal.reading.measurement_table import MeasurementTable
+from minimax_cal.robots.joint_sampling import random_joint_values
 from minimax_cal.robots.robot import Robot
-from minimax_cal.robots.sampling import random_joints
 
-METRE, RADIAN = "m", "rad"
-SPOT = tuple(f"{TARGET}_{axis}" for axis in "xyz")  # the point on the flange, or the ball
-FRAMELESS = "moves nothing that is measured"
-ANGLES = ("_rx", "_ry", "_rz", "_tilt1", "_tilt2")  # endings of names
-PLENTY = 200  # poses that show what no poses could tell
-LINEAR_RANK = 1e-6  # relative singular value below which a linear start says nothing
-SPREAD = (0.05, 0.2)  # where the target may be, from the last frame, per metre of reach
-Told = tuple[str, str, float, float, float]  # name, unit, value, as drawn, sigma [SI]
-UNREADY: Any = None  # what `ready` fills
-Slip = tuple[str, "Instrument"]  # what to say, and the measurements with the slip mended
-Started = Callable[["Instrument"], tuple[Any, FlangePoses, Array]]  # ready, and fitted as drawn
-Limits = Callable[["Instrument", Array], Array]  # of each sum, how far priors let it be off [m]
+METRE_UNIT, RADIAN_UNIT = "m", "rad"
+SPOT = tuple(
+    f"{DEFAULT_TARGET_NAME}_{axis}" for axis in "xyz"
+)  # the point on the flange, or the ball
+MOVES_NOTHING_REASON = "moves nothing that is measured"
+ANGLE_NAME_ENDINGS = ("_rx", "_ry", "_rz", "_tilt1", "_tilt2")  # endings of names
+RANDOM_POSE_COUNT = 200  # poses that show what no poses could tell
+MIN_LINEAR_START_SINGULAR_VALUE = (
+    1e-6  # relative singular value below which a linear start says nothing
+)
+TARGET_OFFSETS_PER_REACH = (
+    0.05,
+    0.2,
+)  # where the target may be, from the last frame, per metre of reach
+ReportedParameter = tuple[str, str, float, float, float]  # name, unit, value, as drawn, sigma [SI]
+NOT_READY: Any = None  # what `ready` fills
+DataCorrection = tuple[str, "Instrument"]  # what to say, and the measurements with the slip mended
+FitNominalArm = Callable[
+    ["Instrument"], tuple[Any, FlangePoses, Array]
+]  # ready, and fitted as drawn
+DistanceLimits = Callable[
+    ["Instrument", Array], Array
+]  # of each sum, how far priors let it be off [m]
 
 
 @dataclass(frozen=True)
-class Columns:
+class InstrumentColumns:
     """How a file of an instrument is known, and read.
 
     announce: a column that says that the file is of the instrument.  own: every column that `read`
@@ -51,7 +62,7 @@ class Columns:
     announce: re.Pattern[str]
     own: re.Pattern[str]
     written: str
-    read: Callable[[Rows], Instrument]
+    read: Callable[[MeasurementTable], Instrument]
     yields: bool = False
 
 
@@ -83,30 +94,31 @@ class Instrument:
 
     at: the m poses (q, line, columns), with points where these were measured.
 
-    Of a class: kind: its name.  unit: of its rows in SI, as m, rad or px; noise and accuracy
-    are reported in it.  words: what is said of it.  by_row: fields with an entry for each
-    pose; chosen: fields that `ready` fills.  file: its columns, None where it has none of its own.
-    options: the fields of the options that are its own.  targets_at: where the points on the flange
-    stand among its own parameters.  given_up: beginnings of those that redundancy takes first.
-    has_length: whether something that it measures is a length.  shrinks: whether an arm that hardly
-    moves fits anything.  refines: whether its starts are to be refined.  row_noise: sigma of a row
-    over that of a number.  costless: parameters that cost no number.  on_arm: whether a point on
-    the flange is among its own.  noise_given: whether the user may say its noise.  alone: what to
-    do instead where nothing else is given, empty where it needs nothing else; alone_bends: whether
-    effects of the arm are fitted, and sought, in it alone all the same.  unmoved: why a link
-    tells nothing that moves nothing.  scale: what it lacks where it has no length standard, and
-    what gives it.  lone_names: of its unknowns from the targets on, as people read them, those of
-    `lone` first.  first_column: the beginning of its first column, for messages.
+    Of a class: kind: its name.  unit: of its rows in SI, as m, rad or px; noise and accuracy are
+    reported in it.  words: what is said of it.  by_row: fields with an entry for each pose; chosen:
+    fields that `ready` fills.  file: its columns, None where it has none of its own. options: the
+    fields of the options that are its own.  targets_at: where the points on the flange stand among
+    its own parameters.  given_up: beginnings of those that redundancy takes first. has_length:
+    whether something that it measures is a length.  shrinks: whether an arm that hardly moves fits
+    anything.  refines: whether its starts are to be refined.  row_noise: sigma of a row over that
+    of a number.  costless_parameter_count: parameters that cost no number.  on_arm: whether a point
+    on the flange is among its own.  noise_given: whether the user may say its noise.  alone: what
+    to do instead where nothing else is given, empty where it needs nothing else; alone_bends:
+    whether effects of the arm are fitted, and sought, in it alone all the same.  unmoved: why a
+    link tells nothing that moves nothing.  scale: what it lacks where it has no length standard,
+    and what gives it.  lone_names: of its unknowns from the targets on, as people read them, those
+    of `single_point_instrument` first.  first_column: the beginning of its first column, for
+    messages.
     """
 
     at: Measurements
 
     kind: ClassVar[str]
-    unit: ClassVar[str] = METRE
+    unit: ClassVar[str] = METRE_UNIT
     words: ClassVar[Words]
     by_row: ClassVar[tuple[str, ...]] = ()
     chosen: ClassVar[tuple[str, ...]] = ()
-    file: ClassVar[Columns | None] = None
+    file: ClassVar[InstrumentColumns | None] = None
     options: ClassVar[tuple[str, ...]] = ()
     targets_at: ClassVar[slice] = slice(0, 3)
     given_up: ClassVar[tuple[str, ...]] = ()
@@ -117,7 +129,7 @@ class Instrument:
     noise_given: ClassVar[bool] = True
     alone: ClassVar[str] = ""
     alone_bends: ClassVar[bool] = False
-    unmoved: ClassVar[str] = FRAMELESS
+    unmoved: ClassVar[str] = MOVES_NOTHING_REASON
     scale: ClassVar[tuple[str, ...]] = ()
     drawn_scale: ClassVar[bool] = False
     lone_names: ClassVar[tuple[str, ...]] = ()
@@ -130,15 +142,15 @@ class Instrument:
         """(e,) names of its own unknowns."""
         raise NotImplementedError
 
-    def starts(self, arm: FlangePoses, free: Array) -> Sequence[Array]:
+    def starts(self, arm: FlangePoses, free_unknowns: Array) -> Sequence[Array]:
         """Values (e,) each from which its own unknowns may be fitted to the arm as drawn.
 
-        free: (e,) True where one may be fitted.
+        free_unknowns: (e,) True where one may be fitted.
         """
         raise NotImplementedError
 
-    def read(self, arm: FlangePoses, own: Array) -> ResidualRows:
-        """What was measured minus what it would measure.  own: (e,)."""
+    def read(self, arm: FlangePoses, unknowns: Array) -> ResidualRows:
+        """What was measured minus what it would measure.  unknowns: (e,)."""
         raise NotImplementedError
 
     # ---- what was measured -------------------------------------------------------------------
@@ -149,72 +161,76 @@ class Instrument:
         return len(self.at.q)
 
     @property
-    def numbers(self) -> Array:
+    def numbers_per_pose(self) -> Array:
         """(m,) how many numbers each row holds: one."""
         return np.ones(self.poses, dtype=int)
 
     @property
-    def points(self) -> int:
+    def point_count(self) -> int:
         """Number of compared points, which turns a sum of squares into a mean motion."""
-        return int(self.numbers.sum())
+        return int(self.numbers_per_pose.sum())
 
     @property
-    def degrees(self) -> int:
+    def degrees_of_freedom(self) -> int:
         """Independent numbers, and as many more as parameters that cost none."""
-        return int(self.numbers.sum()) + self.costless
+        return int(self.numbers_per_pose.sum()) + self.costless_parameter_count
 
     @property
-    def costless(self) -> int:
+    def costless_parameter_count(self) -> int:
         """Parameters that cost no number."""
         return 0
 
     @property
-    def independent(self) -> int:
+    def independent_number_count(self) -> int:
         """How many of the numbers are independent of each other: those of different poses."""
-        _, first = np.unique(groups(self.at), return_index=True)
-        return int(self.numbers[first].sum())
+        _, first = np.unique(group_repeated_poses(self.at), return_index=True)
+        return int(self.numbers_per_pose[first].sum())
 
-    def count(self, held: Array) -> tuple[int, int]:
-        """Numbers behind the errors of training and held-out rows.  held: (m,)."""
-        return int(self.numbers[~held].sum()), int(self.numbers[held].sum())
+    def count_train_and_holdout_numbers(self, holdout_mask: Array) -> tuple[int, int]:
+        """Numbers behind the errors of training and held-out rows.  holdout_mask: (m,)."""
+        return int(self.numbers_per_pose[~holdout_mask].sum()), int(
+            self.numbers_per_pose[holdout_mask].sum()
+        )
 
-    def check(self) -> None:
+    def check_data(self) -> None:
         """Raise DataError where no fit can make sense of them: for fields that are no numbers."""
         for name in self.by_row:
             values = np.asarray(getattr(self, name))
             if len(values) != self.poses:
                 raise DataError(f"{name} has {len(values)} entries; there are {self.poses} poses")
             if values.dtype.kind == "f" and not np.isfinite(values).all():
-                raise DataError(f"{self.says(int(np.argwhere(~np.isfinite(values))[0][0]))}: "
-                                f"{name} is not a finite number")  # fmt: skip
+                raise DataError(
+                    f"{self.row_location(int(np.argwhere(~np.isfinite(values))[0][0]))}: "
+                    f"{name} is not a finite number"
+                )
 
-    def check_training(self) -> None:
+    def check_enough_training_data(self) -> None:
         """Raise DataError where they are too few to be fitted."""
 
-    def columns(self) -> Mapping[str, Array]:
+    def file_columns(self) -> Mapping[str, Array]:
         """What was measured, by the names of a file's columns and in their units."""
         return {}
 
-    def take(self, rows: Array) -> Self:
+    def take_rows(self, rows: Array) -> Self:
         """The measurements at some rows only.  rows: indices or a mask."""
         own = {name: getattr(self, name)[rows] for name in self.by_row}
         return replace(self, at=self.at.take(rows), **own)
 
-    def in_order(self) -> Self:
+    def sort_rows_for_fit(self) -> Self:
         """The rows in the order in which they are fitted."""
         return self
 
-    def screened(self) -> Array:
+    def rows_for_screening(self) -> Array:
         """Rows that tell one start from another."""
         return np.arange(self.poses)
 
-    def says(self, row: int) -> str:
+    def row_location(self, row: int) -> str:
         """Where a row stands, for a message."""
         return f"{self.at.source}:{self.at.line[row]}"
 
-    def held_back(self, options: InstrumentOptions) -> tuple[Array, tuple[str, ...]]:
+    def holdout_rows_and_notices(self, options: InstrumentOptions) -> tuple[Array, tuple[str, ...]]:
         """(m,) True where a row is held out; notices."""
-        return held_out(self.at, options.holdout, options.seed)
+        return select_holdout_rows(self.at, options.holdout, options.seed)
 
     # ---- what it is in a fit -----------------------------------------------------------------
 
@@ -222,20 +238,20 @@ class Instrument:
         """The instrument with what it chooses before a fit."""
         return self
 
-    def at_rows_of(self, other: Self) -> Self:
+    def copy_choices_to(self, other: Self) -> Self:
         """Other measurements of it, with what this one has chosen."""
         return replace(other, **{name: getattr(self, name) for name in self.chosen})
 
-    def beside(self, others: Sequence[Instrument]) -> Self:
+    def adapt_to_other_instruments(self, other_instruments: Sequence[Instrument]) -> Self:
         """The instrument in one fit with all of some others."""
         return self
 
-    def weighed(self, share: Array) -> Self:
+    def with_row_weights(self, row_weights: Array) -> Self:
         """The instrument whose rows have weights (r + c,), where it reads means of them."""
         return self
 
     @property
-    def held(self) -> tuple[str, ...]:
+    def given_unknown_names(self) -> tuple[str, ...]:
         """Its unknowns that are not fitted, as their values are given."""
         return ()
 
@@ -245,150 +261,164 @@ class Instrument:
         return True
 
     @property
-    def given(self) -> int:
+    def given_number_count(self) -> int:
         """Numbers that are given besides those of the data."""
         return 0
 
     @property
-    def choices(self) -> Mapping[str, object]:
+    def choices_for_record(self) -> Mapping[str, object]:
         """What it has chosen where the user has not, for the record."""
         return {}
 
     @property
     def units(self) -> tuple[str, ...]:
         """(e,) SI, of its own unknowns."""
-        return tuple("rad" if name.endswith(ANGLES) else "m" for name in self.names)
+        return tuple("rad" if name.endswith(ANGLE_NAME_ENDINGS) else "m" for name in self.names)
 
     @property
-    def seen(self) -> Measurements:
+    def measurements_with_points(self) -> Measurements:
         """Its poses, with the points that are compared."""
         return self.at
 
     @property
-    def lone(self) -> Instrument | None:
+    def single_point_instrument(self) -> Instrument | None:
         """One point of what it measures, None where it measures no more."""
         return None
 
-    def lone_values(self, own: Array) -> Array:
-        """(e',) unknowns of `lone`, by its own."""
+    def single_point_unknowns(self, unknowns: Array) -> Array:
+        """(e',) unknowns of `single_point_instrument`, by its own."""
         raise NotImplementedError
 
-    def base(self, own: Array) -> tuple[Array, Array]:
+    def base_rotation_and_origin(self, unknowns: Array) -> tuple[Array, Array]:
         """Rotation (3, 3) and origin (3,) of the robot's base in its frame [m]."""
         return np.eye(3), np.zeros(3)
 
-    def targets(self, own: Array) -> Array:
+    def flange_points(self, unknowns: Array) -> Array:
         """(k, 3) points on the flange, its origin where it has none of its own [m]."""
-        spots = own[self.targets_at].reshape(-1, 3)
+        spots = unknowns[self.targets_at].reshape(-1, 3)
         return np.asarray(spots if len(spots) else np.zeros((1, 3)))
 
-    def elsewhere(self, robot: Robot, own: Array) -> Self:
+    def at_random_poses(self, robot: Robot, unknowns: Array) -> Self:
         """The instrument at plenty of poses that it could measure, of an arm: at any."""
-        count = max(PLENTY, 5 * robot.joints + 6 + len(self.names))
-        at, names = anywhere(robot, count), self.at.target_names
+        count = max(RANDOM_POSE_COUNT, 5 * robot.joints + 6 + len(self.names))
+        at, names = build_random_poses(robot, count), self.at.target_names
         at = replace(at, y=np.zeros((count, len(names), 3)), target_names=names)
         blank = {name: np.zeros((count, *getattr(self, name).shape[1:])) for name in self.by_row}
         return replace(self, at=at, **blank)
 
-    def fitting(self, robot: Robot, own: Array) -> Self:
+    def at_exactly_fitting_poses(self, robot: Robot, unknowns: Array) -> Self:
         """The instrument at poses near its own where an arm itself fits it."""
         return self
 
-    def shapeless(self, arm: FlangePoses, own: Array) -> Array:
+    def projectors_on_empty_rows(self, arm: FlangePoses, unknowns: Array) -> Array:
         """(m, r, r) projector, pose by pose, on sums of its rows that hold no number."""
         return np.zeros((self.poses, 0, 0))
 
     # ---- how well it is fitted ---------------------------------------------------------------
 
     @property
-    def parts(self) -> tuple[str, ...]:
-        """What each row of `errors` is."""
+    def part_names(self) -> tuple[str, ...]:
+        """What each row of `part_errors` is."""
         return (self.kind,)
 
-    def mean_square(self, arm: FlangePoses, own: Array) -> float:
+    def mean_square_error(self, arm: FlangePoses, unknowns: Array) -> float:
         """Of the misses of its points [unit^2]."""
-        return float((self.read(arm, own).residual ** 2).sum() / self.points)
+        return float((self.read(arm, unknowns).residual ** 2).sum() / self.point_count)
 
-    def errors(self, arm: FlangePoses, own: Array, held: Array) -> Array:
+    def part_errors(self, arm: FlangePoses, unknowns: Array, holdout_mask: Array) -> Array:
         """(m, parts, 3), NaN where not measured [unit]; numbers first."""
-        rows = self.read(arm, own)
-        out = np.full((self.poses, len(self.parts), 3), np.nan)
+        rows = self.read(arm, unknowns)
+        out = np.full((self.poses, len(self.part_names), 3), np.nan)
         part = rows.part if len(rows.part) else np.zeros(len(rows.pose), dtype=int)
         out[rows.pose, part] = 0.0
         out[rows.pose, part, 0] = rows.residual
         return out
 
-    def turns(self, arm: FlangePoses, own: Array) -> Array:
+    def orientation_errors(self, arm: FlangePoses, unknowns: Array) -> Array:
         """(m,) errors of orientation [rad], empty where none is measured."""
         return np.zeros(0)
 
-    def told(self, own: Array, drawn: Array, covariance: Array) -> tuple[Told, ...]:
+    def parameters_for_report(
+        self, unknowns: Array, nominal_unknowns: Array, covariance: Array
+    ) -> tuple[ReportedParameter, ...]:
         """Those of its unknowns, the last ones, that people are told otherwise.
 
-        own, drawn: (e,) found, and fitted to the arm as drawn.  covariance: (e, e).
+        unknowns, nominal_unknowns: (e,) found, and fitted to the arm as drawn.  covariance: (e, e).
         """
         return ()
 
-    def read_out(self, own: Array) -> Array:
+    def unknowns_for_report(self, unknowns: Array) -> Array:
         """(e,) of its unknowns, as people are told them."""
-        return own
+        return unknowns
 
-    def placed(self, arm: FlangePoses, own: Array, drawn: Array) -> dict[str, Any]:
-        """For JSON: what was fitted besides the robot.  drawn: (e,) to the arm as drawn."""
+    def fitted_values_to_dict(
+        self, arm: FlangePoses, unknowns: Array, nominal_unknowns: Array
+    ) -> dict[str, Any]:
+        """For JSON: what was fitted besides the robot.  nominal_unknowns: (e,) to the arm as
+        drawn.
+        """
         return {}
 
     # ---- slips and remarks -------------------------------------------------------------------
 
     @classmethod
-    def check_options(cls, every: Sequence[Any], options: InstrumentOptions) -> None:
+    def check_options(cls, instruments: Sequence[Any], options: InstrumentOptions) -> None:
         """Raise OptionError for wrong choices, of all its files."""
 
-    def slips(self) -> Iterable[Slip]:
+    def propose_data_corrections(self) -> Iterable[DataCorrection]:
         """Slips of its own, besides those of joints."""
         return ()
 
-    def tried(self) -> Self:
+    def thin_for_trials(self) -> Self:
         """At some of the poses, that are enough to try slips."""
         return self
 
-    def check_given(self, started: Started) -> None:
+    def check_given_values(self, fit_nominal_arm: FitNominalArm) -> None:
         """Raise DataError for what is given and cannot be."""
 
-    def check_start(self, started: Started, limits: Limits) -> None:
-        """Raise for what shows where the arm as drawn, `started`, fits it."""
+    def check_nominal_fit(
+        self, fit_nominal_arm: FitNominalArm, distance_limits: DistanceLimits
+    ) -> None:
+        """Raise for what shows where the arm as drawn, `fit_nominal_arm`, fits it."""
 
-    def remarks(self, parameters: Sequence[Any], noise: float) -> tuple[str, ...]:
+    def list_remarks(self, parameters: Sequence[Any], noise: float) -> tuple[str, ...]:
         """What the reader should know.  parameters: its own, found.  noise: of a number [unit]."""
         return ()
 
-    def wider(self) -> Mapping[str, object]:
+    def options_for_more_parameters(self) -> Mapping[str, object]:
         """Options that would fit more of it."""
         return {}
 
-    def told_wider(self, before: float, after: float) -> tuple[str, str]:
-        """What to say, and the mend, where `wider` explains most.  Noises [m]."""
+    def describe_wider_fit(self, noise_before: float, noise_after: float) -> tuple[str, str]:
+        """What to say, and the mend, where `options_for_more_parameters` explains most.  Noises
+        [m].
+        """
         return "", ""
 
 
 D = TypeVar("D", bound=Instrument)
 
 
-def spots_aside(arm: FlangePoses, first: Array) -> list[Array]:
+def spots_aside(arm: FlangePoses, first_spot: Array) -> list[Array]:
     """Places (3,) on the flange worth a start: a first one, the last frame, and about it [m]."""
-    aside = np.concatenate([np.zeros((1, 3)), *(s * np.eye(3) for s in SPREAD), -0.1 * np.eye(3)])
-    return [first, *(arm.reach * aside)]
+    aside = np.concatenate(
+        [np.zeros((1, 3)), *(s * np.eye(3) for s in TARGET_OFFSETS_PER_REACH), -0.1 * np.eye(3)]
+    )
+    return [first_spot, *(arm.reach * aside)]
 
 
-def scaled_lstsq(matrix: Array, right: Array) -> Array:
+def scaled_least_squares(matrix: Array, right_side: Array) -> Array:
     """Least squares with columns scaled to one; the least solution where poses do not tell."""
     norm = np.linalg.norm(matrix, axis=0)
     norm = np.where(norm > 0.0, norm, 1.0)
-    return np.asarray(np.linalg.lstsq(matrix / norm, right, rcond=LINEAR_RANK)[0] / norm)
+    return np.asarray(
+        np.linalg.lstsq(matrix / norm, right_side, rcond=MIN_LINEAR_START_SINGULAR_VALUE)[0] / norm
+    )
 
 
-def anywhere(robot: Robot, poses: int) -> Measurements:
+def build_random_poses(robot: Robot, pose_count: int) -> Measurements:
     """Random poses over the joints' whole range, nothing measured."""
-    return bare(random_joints(robot, (poses,), np.random.default_rng(0)), {})
+    return bare(random_joint_values(robot, (pose_count,), np.random.default_rng(0)), {})
 
 
 def bare(q: Array, columns: Mapping[str, Array], **measured: Array) -> Measurements:
@@ -404,34 +434,36 @@ def bare(q: Array, columns: Mapping[str, Array], **measured: Array) -> Measureme
     return Measurements(q, np.zeros((len(q), 0, 3)), (), sliding, np.arange(len(q)) + 1, extra)
 
 
-def checked(data: D) -> D:
+def check_instrument_data(data: D) -> D:
     """The data, if a fit can make sense of them.  Raises DataError."""
     where = data.at.source
     if not data.poses:
         raise DataError(f"{where}: holds no poses")
     if not np.isfinite(data.at.q).all():
         row, joint = np.argwhere(~np.isfinite(data.at.q))[0]
-        raise DataError(f"{data.says(row)}: joint {joint + 1} is not a finite number")
-    if len(np.unique(groups(data.at))) == 1:
+        raise DataError(f"{data.row_location(row)}: joint {joint + 1} is not a finite number")
+    if len(np.unique(group_repeated_poses(data.at))) == 1:
         raise DataError(
             f"{where}: holds one pose only; its joint values must differ from row to row"
         )
-    data.check()
+    data.check_data()
     return data
 
 
-def without_blind(data: D, blind: Array) -> D:
-    """The data of a file without the rows at which nothing was measured.  blind: (m,) mask."""
+def drop_unmeasured_rows(data: D, unmeasured_rows: Array) -> D:
+    """The data of a file without the rows at which nothing was measured.  unmeasured_rows: (m,)
+    mask.
+    """
     path = data.at.source
-    if blind.all():
+    if unmeasured_rows.all():
         raise DataError(f"{path}: nothing was measured at any pose")
-    if not blind.any():
+    if not unmeasured_rows.any():
         return data
-    notice = f"{path}: {blind.sum()} rows hold nothing measured and are left out"
-    data = data.take(~blind)
+    notice = f"{path}: {unmeasured_rows.sum()} rows hold nothing measured and are left out"
+    data = data.take_rows(~unmeasured_rows)
     return replace(data, at=replace(data.at, notices=(*data.at.notices, notice)))
 
 
-def different(at: Measurements, rows: Array) -> int:
+def count_distinct_poses(measurements: Measurements, rows: Array) -> int:
     """How many different poses some rows (m,) hold."""
-    return len(np.unique(groups(at)[rows]))
+    return len(np.unique(group_repeated_poses(measurements)[rows]))

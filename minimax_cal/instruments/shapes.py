@@ -9,18 +9,21 @@ from itertools import pairwise
 import numpy as np
 import scipy
 
-from minimax_cal.ground.arrays import Array
-from minimax_cal.instruments.instrument import SPOT, scaled_lstsq, spots_aside
+from minimax_cal.core.arrays import Array
+from minimax_cal.instruments.instrument import SPOT, scaled_least_squares, spots_aside
 from minimax_cal.instruments.protocol import FlangePoses
-from minimax_cal.instruments.wires import linear_target
-from minimax_cal.robots.kinematics import rotation
-from minimax_cal.robots.transforms import nearest_rotation
+from minimax_cal.instruments.wires import solve_linear_target
+from minimax_cal.robots.kinematics import rotation_from_vector
+from minimax_cal.robots.transforms import nearest_rotations
 
-PLANE, SPHERE = "plane", "sphere"
+PLANE_KIND, SPHERE_KIND = "plane", "sphere"
 
-MAX_STARTS, MAX_TRIES = 3, 60  # places of the ball that are refined; gaps looked at for each
-ROUNDS = 5  # of a sphere's fit by its distances
-BODY = tuple(f"body_{axis}" for axis in ("x", "y", "z", "rx", "ry", "rz"))
+MAX_BALL_STARTS, MAX_BALL_EVALUATIONS = (
+    3,
+    60,
+)  # places of the ball that are refined; gaps looked at for each
+SPHERE_FIT_ROUNDS = 5  # of a sphere's fit by its distances
+BODY_PARAMETER_NAMES = tuple(f"body_{axis}" for axis in ("x", "y", "z", "rx", "ry", "rz"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +36,7 @@ class Surface:
     """
 
     label: str
-    kind: str = PLANE
+    kind: str = PLANE_KIND
     size: float = np.nan
     normal: Array = field(default_factory=lambda: np.zeros(0))
 
@@ -43,15 +46,15 @@ class Surface:
         return bool(len(self.normal))
 
     @property
-    def ends(self) -> tuple[str, ...]:
+    def parameter_endings(self) -> tuple[str, ...]:
         """Endings of its own parameters' names, the size last."""
-        if self.kind == SPHERE:
+        if self.kind == SPHERE_KIND:
             return ("x", "y", "z", "radius")
         return ("offset",) if self.is_face else ("tilt1", "tilt2", "offset")
 
 
 @dataclass(frozen=True, eq=False)
-class Shapes:
+class SurfaceParameters:
     """Which surfaces there are, and where their parameters stand among the instrument's own.
 
     surfaces: s of them.  axes: (s, 3, 3) rows n, u, v: of a plane the normal from which its tilts
@@ -68,30 +71,32 @@ class Shapes:
         """Whether some are faces of a body."""
         return any(surface.is_face for surface in self.surfaces)
 
-    def own(self) -> tuple[str, ...]:
+    def parameter_names(self) -> tuple[str, ...]:
         """Names: target, surfaces, body, radius of the ball."""
-        names = [f"surface_{s.label}_{end}" for s in self.surfaces for end in s.ends]
-        return (*SPOT, *names, *(BODY if self.has_body else ()), "ball_radius")
+        names = [f"surface_{s.label}_{end}" for s in self.surfaces for end in s.parameter_endings]
+        return (*SPOT, *names, *(BODY_PARAMETER_NAMES if self.has_body else ()), "ball_radius")
 
-    def given(self) -> tuple[str, ...]:
+    def given_parameter_names(self) -> tuple[str, ...]:
         """Those of them whose values are given."""
-        known = [(f"surface_{s.label}_{s.ends[-1]}", s.size) for s in self.surfaces]
+        known = [(f"surface_{s.label}_{s.parameter_endings[-1]}", s.size) for s in self.surfaces]
         known += [("ball_radius", self.ball_radius)]
         return tuple(name for name, value in known if np.isfinite(value))
 
-    def slots(self) -> list[slice]:
+    def surface_slices(self) -> list[slice]:
         """Of each surface."""
-        ends = 3 + np.cumsum([0, *(len(s.ends) for s in self.surfaces)])
+        ends = 3 + np.cumsum([0, *(len(s.parameter_endings) for s in self.surfaces)])
         return [slice(int(a), int(b)) for a, b in pairwise(ends)]
 
-    def body(self, own: Array) -> tuple[Array, Array]:
+    def body_rotation_and_origin(self, unknowns: Array) -> tuple[Array, Array]:
         """Rotation (3, 3) and origin (3,) of the body."""
-        return self.turn @ rotation(own[-4:-1]), own[-7:-4]
+        return self.turn @ rotation_from_vector(unknowns[-4:-1]), unknowns[-7:-4]
 
-    def plane(self, at: int, own: Array) -> tuple[Array, Array, Array]:
+    def plane_normal_and_derivatives(
+        self, surface_index: int, unknowns: Array
+    ) -> tuple[Array, Array, Array]:
         """Normal (3,) of a plane, and its derivatives by the two tilts."""
-        n0, u, v = self.axes[at]
-        a, b, _ = own[self.slots()[at]]
+        n0, u, v = self.axes[surface_index]
+        a, b, _ = unknowns[self.surface_slices()[surface_index]]
         size = np.sqrt(1.0 + a**2 + b**2)
         n = (n0 + a * u + b * v) / size
         one, other = ((w - n * (n @ w)) / size for w in (u, v))
@@ -101,58 +106,62 @@ class Shapes:
 # ---- a start without a guess -------------------------------------------------------------------
 
 
-def fit_plane(p: Array) -> tuple[Array, float]:
+def fit_plane(points: Array) -> tuple[Array, float]:
     """Normal (3,) and offset of the plane that points (m, 3) lie on best [m]."""
-    centre = p.mean(axis=0)
-    normal = np.linalg.svd(p - centre, full_matrices=False)[2][-1]
+    centre = points.mean(axis=0)
+    normal = np.linalg.svd(points - centre, full_matrices=False)[2][-1]
     return normal, float(normal @ centre)
 
 
-def fit_sphere(p: Array, radius: float) -> tuple[Array, float]:
+def fit_sphere(points: Array, given_radius: float) -> tuple[Array, float]:
     """Centre (3,) and radius of the sphere that points (m, 3) lie on best [m].
 
-    Algebraic, |p|^2 = 2 p.C + k, then by distances.  radius: given, or NaN.
+    Algebraic, |p|^2 = 2 p.C + k, then by distances.  given_radius: given, or NaN.
     """
-    middle = p.mean(axis=0)
-    q = p - middle
-    found = scaled_lstsq(np.column_stack([2.0 * q, np.ones(len(q))]), (q**2).sum(axis=1))
+    middle = points.mean(axis=0)
+    q = points - middle
+    found = scaled_least_squares(np.column_stack([2.0 * q, np.ones(len(q))]), (q**2).sum(axis=1))
     centre, size = found[:3], float(np.sqrt(max(found[3] + found[:3] @ found[:3], 1e-12)))
-    size = radius if np.isfinite(radius) else size
-    for _ in range(ROUNDS):
+    size = given_radius if np.isfinite(given_radius) else size
+    for _ in range(SPHERE_FIT_ROUNDS):
         off = q - centre
         distance = np.maximum(np.linalg.norm(off, axis=1), 1e-12)
-        columns = [-off / distance[:, None], np.full((len(q), int(np.isnan(radius))), -1.0)]
-        step = scaled_lstsq(np.concatenate(columns, axis=1), size - distance)
+        columns = [-off / distance[:, None], np.full((len(q), int(np.isnan(given_radius))), -1.0)]
+        step = scaled_least_squares(np.concatenate(columns, axis=1), size - distance)
         centre, size = centre + step[:3], size + float(step[3:].sum())
     return middle + centre, size
 
 
-def found_on(
-    p: Array, surfaces: Sequence[Surface], ball: float, touched: Array
+def fit_surfaces_to_ball_centres(
+    ball_centres: Array, surfaces: Sequence[Surface], ball_radius: float, touched_surface: Array
 ) -> list[tuple[Array, float]]:
     """The best plane or sphere through the ball's centres p (m, 3) of each surface."""
     out = []
     for at, surface in enumerate(surfaces):
-        here = p[touched == at]
+        here = ball_centres[touched_surface == at]
         out.append(
-            fit_sphere(here, surface.size + ball) if surface.kind == SPHERE else fit_plane(here)
+            fit_sphere(here, surface.size + ball_radius)
+            if surface.kind == SPHERE_KIND
+            else fit_plane(here)
         )
     return out
 
 
-def linear_spots(arm: FlangePoses, surfaces: Sequence[Surface], touched: Array) -> list[Array]:
+def find_linear_ball_positions(
+    arm: FlangePoses, surfaces: Sequence[Surface], touched_surface: Array
+) -> list[Array]:
     """Places (3,) of the ball on the flange that each surface by itself suggests [m].
 
     With the last frame (R, o), a plane's n.(o + R t) = c is linear and homogeneous in n, the nine
-    products n t' and c; of a sphere see `wires.linear_target`.
+    products n t' and c; of a sphere see `wires.solve_linear_target`.
     """
     out = []
     for at, surface in enumerate(surfaces):
-        here = touched == at
+        here = touched_surface == at
         o, turn = arm.origin[here], arm.rotation[here]
-        if surface.kind == SPHERE:
+        if surface.kind == SPHERE_KIND:
             some = arm._replace(origin=o, rotation=turn)
-            out.append(linear_target(some, np.zeros((len(o), 1)), with_offset=False))
+            out.append(solve_linear_target(some, np.zeros((len(o), 1)), with_offset=False))
             continue
         rows = np.concatenate([o, turn.reshape(len(o), 9), -np.ones((len(o), 1))], axis=1)
         found = np.linalg.svd(rows)[2][-1]
@@ -161,9 +170,9 @@ def linear_spots(arm: FlangePoses, surfaces: Sequence[Surface], touched: Array) 
     return [spot for spot in out if np.isfinite(spot).all()]
 
 
-def placed_best(
-    arm: FlangePoses, surfaces: tuple[Surface, ...], ball: float, touched: Array
-) -> tuple[Shapes, Array]:
+def fit_ball_and_surfaces(
+    arm: FlangePoses, surfaces: tuple[Surface, ...], ball_radius: float, touched_surface: Array
+) -> tuple[SurfaceParameters, Array]:
     """Where ball and surfaces fit the arm as drawn best, and their values.
 
     For a given place of the ball on the flange each surface is found in closed form, which leaves
@@ -172,55 +181,63 @@ def placed_best(
 
     def found(spot: Array) -> tuple[Array, list[tuple[Array, float]]]:
         p = arm.place(spot)
-        return p, found_on(p, surfaces, ball, touched)
+        return p, fit_surfaces_to_ball_centres(p, surfaces, ball_radius, touched_surface)
 
     def misses(spot: Array) -> Array:
         p, each = found(spot)
         out = np.zeros(len(p))
         for at, (place, size) in enumerate(each):
-            here = touched == at
-            round_ = surfaces[at].kind == SPHERE
+            here = touched_surface == at
+            round_ = surfaces[at].kind == SPHERE_KIND
             reached = np.linalg.norm(p[here] - place, axis=1) if round_ else p[here] @ place
             out[here] = reached - size
         return out
 
-    spots = [*linear_spots(arm, surfaces, touched), *spots_aside(arm, np.zeros(3))[1:]]
-    best = sorted(spots, key=lambda one: float((misses(one) ** 2).sum()))[:MAX_STARTS]
+    spots = [
+        *find_linear_ball_positions(arm, surfaces, touched_surface),
+        *spots_aside(arm, np.zeros(3))[1:],
+    ]
+    best = sorted(spots, key=lambda one: float((misses(one) ** 2).sum()))[:MAX_BALL_STARTS]
     tries = [
-        scipy.optimize.least_squares(misses, spot, method="lm", max_nfev=MAX_TRIES) for spot in best
+        scipy.optimize.least_squares(misses, spot, method="lm", max_nfev=MAX_BALL_EVALUATIONS)
+        for spot in best
     ]
     spot = min(tries, key=lambda one: float(one.cost)).x
     p, each = found(spot)
-    return placed_surfaces(spot, p, each, surfaces, ball, touched)
+    return build_surface_unknowns(spot, p, each, surfaces, ball_radius, touched_surface)
 
 
-def placed_surfaces(
-    spot: Array,
-    p: Array,
-    each: list[tuple[Array, float]],
+def build_surface_unknowns(
+    ball_position: Array,
+    ball_centres: Array,
+    fitted_surfaces: list[tuple[Array, float]],
     surfaces: tuple[Surface, ...],
-    ball: float,
-    touched: Array,
-) -> tuple[Shapes, Array]:
-    """The surfaces found, as a block's shapes and values.  p: (m, 3) of the ball's centre [m]."""
+    ball_radius: float,
+    touched_surface: Array,
+) -> tuple[SurfaceParameters, Array]:
+    """The surfaces found, as a block's shapes and values.  ball_centres: (m, 3) of the ball's
+    centre [m].
+    """
     axes = np.zeros((len(surfaces), 3, 3))
-    for at, (place, _) in enumerate(each):
-        if surfaces[at].kind == PLANE:
+    for at, (place, _) in enumerate(fitted_surfaces):
+        if surfaces[at].kind == PLANE_KIND:
             axes[at] = np.linalg.svd(place[None])[2]
             axes[at, 0] = place
-    turn, origin, radius = body_of(p, each, surfaces, ball, touched)
-    shapes = Shapes(surfaces, ball, axes, turn)
-    own = np.zeros(len(shapes.own()))
-    own[:3], own[-1] = spot, radius
+    turn, origin, radius = fit_body_and_ball_radius(
+        ball_centres, fitted_surfaces, surfaces, ball_radius, touched_surface
+    )
+    shapes = SurfaceParameters(surfaces, ball_radius, axes, turn)
+    own = np.zeros(len(shapes.parameter_names()))
+    own[:3], own[-1] = ball_position, radius
     if shapes.has_body:
         own[-7:-4] = origin
-    for at, slot in enumerate(shapes.slots()):
-        surface, (place, size) = surfaces[at], each[at]
+    for at, slot in enumerate(shapes.surface_slices()):
+        surface, (place, size) = surfaces[at], fitted_surfaces[at]
         if surface.is_face:
-            middle = p[touched == at].mean(axis=0)
+            middle = ball_centres[touched_surface == at].mean(axis=0)
             drawn = float((turn @ surface.normal) @ (middle - origin)) - radius
             own[slot] = surface.size if np.isfinite(surface.size) else drawn
-        elif surface.kind == SPHERE:
+        elif surface.kind == SPHERE_KIND:
             radius_here = surface.size if np.isfinite(surface.size) else size - radius
             own[slot] = [*place, radius_here]
         else:
@@ -228,42 +245,49 @@ def placed_surfaces(
     return shapes, own
 
 
-def body_of(
-    p: Array,
-    each: list[tuple[Array, float]],
+def fit_body_and_ball_radius(
+    ball_centres: Array,
+    fitted_surfaces: list[tuple[Array, float]],
     surfaces: tuple[Surface, ...],
-    ball: float,
-    touched: Array,
+    ball_radius: float,
+    touched_surface: Array,
 ) -> tuple[Array, Array, float]:
     """Rotation (3, 3) and origin (3,) of the body by its faces, and the radius of the ball [m].
 
     The ball touches from outside, so that the other contacts with the body lie inwards.
     """
     faces = [at for at, surface in enumerate(surfaces) if surface.is_face]
-    radius = ball if np.isfinite(ball) else 0.0
-    spheres = [size - s.size for (_, size), s in zip(each, surfaces, strict=True)
-               if s.kind == SPHERE and np.isfinite(s.size)]  # fmt: skip
-    radius = float(np.mean(spheres)) if spheres and not np.isfinite(ball) else radius
+    radius = ball_radius if np.isfinite(ball_radius) else 0.0
+    spheres = [size - s.size for (_, size), s in zip(fitted_surfaces, surfaces, strict=True)
+               if s.kind == SPHERE_KIND and np.isfinite(s.size)]  # fmt: skip
+    radius = float(np.mean(spheres)) if spheres and not np.isfinite(ball_radius) else radius
     if not faces:
         return np.eye(3), np.zeros(3), radius
-    middle = p[np.isin(touched, faces)].mean(axis=0)
+    middle = ball_centres[np.isin(touched_surface, faces)].mean(axis=0)
     outward = []
     for at in faces:
-        normal, offset = each[at]
+        normal, offset = fitted_surfaces[at]
         outward.append(normal if normal @ middle <= offset else -normal)
     drawn = np.array([surfaces[at].normal for at in faces])
-    turn = nearest_rotation(np.array(outward).T @ drawn)
+    turn = nearest_rotations(np.array(outward).T @ drawn)
     known = [at for at in faces if np.isfinite(surfaces[at].size)]
-    rows = np.array([np.append(turn @ surfaces[at].normal, np.isnan(ball)) for at in known])
-    reached = np.array([turn @ surfaces[at].normal @ p[touched == at].mean(axis=0) for at in known])
-    sizes = np.array([surfaces[at].size for at in known]) + (ball if np.isfinite(ball) else 0.0)
+    rows = np.array([np.append(turn @ surfaces[at].normal, np.isnan(ball_radius)) for at in known])
+    reached = np.array(
+        [
+            turn @ surfaces[at].normal @ ball_centres[touched_surface == at].mean(axis=0)
+            for at in known
+        ]
+    )
+    sizes = np.array([surfaces[at].size for at in known]) + (
+        ball_radius if np.isfinite(ball_radius) else 0.0
+    )
     if not known:
         return turn, middle, radius
-    found = middle_body(rows, reached - sizes, middle)
-    return turn, found[:3], float(found[3]) if np.isnan(ball) and len(known) > 3 else radius
+    found = solve_body_origin_and_radius(rows, reached - sizes, middle)
+    return turn, found[:3], float(found[3]) if np.isnan(ball_radius) and len(known) > 3 else radius
 
 
-def middle_body(rows: Array, offset: Array, middle: Array) -> Array:
+def solve_body_origin_and_radius(rows: Array, offsets: Array, contact_middle: Array) -> Array:
     """(4,) origin and radius nearest to the contacts' middle that the offsets allow."""
-    guess = np.append(middle, 0.0)
-    return np.asarray(guess + scaled_lstsq(rows, offset - rows @ guess))
+    guess = np.append(contact_middle, 0.0)
+    return np.asarray(guess + scaled_least_squares(rows, offsets - rows @ guess))

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
-from minimax_cal.ground.errors import DataError
-from minimax_cal.measuring.measurements import Measurements, Origin, measurements_in
-from minimax_cal.reading.rows import read_rows
-from minimax_cal.reading.sheet import Sheet, open_text
+from minimax_cal.core.errors import DataError
+from minimax_cal.measuring.measurements import Measurements, RowOrigin, build_measurements
+from minimax_cal.reading.measurement_table import read_measurement_table
+from minimax_cal.reading.text_sheet import Sheet, read_text_sheet
 
-MOST_FILES = 100
-LABELS = ("pose", "group")  # which mean something in their own file only
+MAX_CAMPAIGN_FILES = 100
+FILE_LABEL_COLUMNS = ("pose", "group")  # which mean something in their own file only
 
 
 def read_campaigns(paths: Sequence[Path | str | Sheet]) -> Measurements:
@@ -43,20 +43,20 @@ def read_campaigns(paths: Sequence[Path | str | Sheet]) -> Measurements:
     """
     if not paths:
         raise DataError("no file of measurements is given")
-    if len(paths) > MOST_FILES:
-        raise DataError(f"{len(paths)} files of measurements; give at most {MOST_FILES}")
-    sheets = [open_text(path) for path in paths]
-    if len(paths) > 1 and (whole := apart(sheets)):
+    if len(paths) > MAX_CAMPAIGN_FILES:
+        raise DataError(f"{len(paths)} files of measurements; give at most {MAX_CAMPAIGN_FILES}")
+    sheets = [read_text_sheet(path) for path in paths]
+    if len(paths) > 1 and (whole := import_separate_points_and_joints(sheets)):
         return whole
-    parts = [measurements_in(read_rows(sheet)) for sheet in sheets]
+    parts = [build_measurements(read_measurement_table(sheet)) for sheet in sheets]
     return (
         parts[0]
         if len(parts) == 1
-        else campaigns(parts, session_names([sheet.path for sheet in sheets]))
+        else join_campaigns(parts, session_names_from_paths([sheet.path for sheet in sheets]))
     )
 
 
-def apart(sheets: Sequence[Sheet]) -> Measurements | None:
+def import_separate_points_and_joints(sheets: Sequence[Sheet]) -> Measurements | None:
     """Measurements whose points and joints lie in files of their own; None where none does.
 
     Raises DataError.
@@ -64,15 +64,18 @@ def apart(sheets: Sequence[Sheet]) -> Measurements | None:
     from minimax_cal.measuring import importers  # few lie apart
 
     try:
-        readings = [importers.read_any(sheet, importers.Given()) for sheet in sheets]
+        readings = [
+            importers.read_in_first_fitting_format(sheet, importers.ImportOptions())
+            for sheet in sheets
+        ]
     except DataError:
         return None  # the reader of each says what is wrong
-    if all(reading.smrs and reading.joints for reading in readings):
+    if all(reading.target_numbers and reading.joint_columns for reading in readings):
         return None
     return importers.import_files(sheets).understood()
 
 
-def session_names(paths: Sequence[Path | str]) -> list[str]:
+def session_names_from_paths(paths: Sequence[Path | str]) -> list[str]:
     """What the sessions of files are called: by the stem, or as much of the path as differs.
 
     Raises DataError for a file that is given twice.
@@ -88,50 +91,57 @@ def session_names(paths: Sequence[Path | str]) -> list[str]:
     return [str(path) for path in whole]  # stems alike, endings not
 
 
-def campaigns(parts: Sequence[Measurements], names: Sequence[str]) -> Measurements:
+def join_campaigns(campaigns: Sequence[Measurements], session_names: Sequence[str]) -> Measurements:
     """Measurements of one arm as sessions of one set.
 
-    names: of the sessions; where a part has sessions itself these come after it, as june/2.  Lines
-    of the second part are those of its file and a round number more, and so on.  Targets go by
-    their names.  Raises DataError for parts of different joints.
+    session_names: of the sessions; where a part has sessions itself these come after it, as june/2.
+    Lines of the second part are those of its file and a round number more, and so on.  Targets go
+    by their names.  Raises DataError for parts of different joints.
     """
-    check_alike(parts)
-    first_of = {part.digest: part for part in reversed(parts) if part.digest}
-    for part in parts:
+    check_same_joints(campaigns)
+    first_of = {part.digest: part for part in reversed(campaigns) if part.digest}
+    for part in campaigns:
         if (same := first_of.get(part.digest, part)) is not part:
             raise DataError(
                 f"{part.source}: holds the same as {same.source}; a campaign counts once"
             )
-    last = max(int(part.line.max(initial=1)) for part in parts)
+    last = max(int(part.line.max(initial=1)) for part in campaigns)
     step = int(10 ** max(3, len(str(last))))  # a round number above all lines
-    targets = tuple(dict.fromkeys(name for part in parts for name in part.target_names))
-    first, *others = in_turn(
+    targets = tuple(dict.fromkeys(name for part in campaigns for name in part.target_names))
+    first, *others = shift_overlapping_times(
         [
-            part.everywhere(partial(placed, name=name, more=number * step, targets=targets))
-            for number, (part, name) in enumerate(zip(parts, names, strict=True))
+            part.change_with_set_aside(
+                partial(label_as_session, name=name, more=number * step, targets=targets)
+            )
+            for number, (part, name) in enumerate(zip(campaigns, session_names, strict=True))
         ]
     )
     said = ", ".join(
         f"{part.source} from line {number * step + 1}"
-        for number, part in enumerate(parts)
+        for number, part in enumerate(campaigns)
         if number
     )
     return replace(
-        first.followed_by(*others),
+        first.append_measurements(*others),
         notices=(
-            *(notice for part in parts for notice in part.notices),
-            f"{len(parts)} files are sessions {', '.join(names)}; lines are numbered on: {said}",
+            *(notice for part in campaigns for notice in part.notices),
+            (
+                f"{len(campaigns)} files are sessions {', '.join(session_names)}"
+                f"; lines are numbered on: {said}"
+            ),
         ),
-        source=" + ".join(part.source for part in parts),
-        origins=tuple(Origin((part.source,), begin=i * step) for i, part in enumerate(parts)),
-        digest=hashlib.sha256("".join(part.digest for part in parts).encode()).hexdigest(),
+        source=" + ".join(part.source for part in campaigns),
+        origins=tuple(
+            RowOrigin((part.source,), begin=i * step) for i, part in enumerate(campaigns)
+        ),
+        digest=hashlib.sha256("".join(part.digest for part in campaigns).encode()).hexdigest(),
     )
 
 
-def check_alike(parts: Sequence[Measurements]) -> None:
+def check_same_joints(campaigns: Sequence[Measurements]) -> None:
     """Raise DataError for parts whose joints are not those of the first."""
-    first = parts[0]
-    for part in parts[1:]:
+    first = campaigns[0]
+    for part in campaigns[1:]:
         if part.q.shape[1] != first.q.shape[1]:
             raise DataError(
                 f"{part.source}: has {part.q.shape[1]} joints, {first.source} has "
@@ -145,7 +155,9 @@ def check_alike(parts: Sequence[Measurements]) -> None:
             )
 
 
-def placed(part: Measurements, name: str, more: int, targets: tuple[str, ...]) -> Measurements:
+def label_as_session(
+    part: Measurements, name: str, more: int, targets: tuple[str, ...]
+) -> Measurements:
     """A part as the session of a name, before that of the file where it has several.
 
     Its lines are counted on, its labels apart from those of other files; of all targets those that
@@ -155,7 +167,7 @@ def placed(part: Measurements, name: str, more: int, targets: tuple[str, ...]) -
     several = len(np.unique(own)) > 1
     label = np.array([f"{name}/{cell}" if several and cell else name for cell in own], dtype=str)
     columns = {**part.columns, "session": label}
-    for column in {*LABELS} & {*columns}:
+    for column in {*FILE_LABEL_COLUMNS} & {*columns}:
         cells = columns[column].astype(str)
         columns[column] = np.array([f"{name}/{cell}" if cell else "" for cell in cells], dtype=str)
     y = np.full((part.poses, len(targets), 3), np.nan)
@@ -170,22 +182,26 @@ def placed(part: Measurements, name: str, more: int, targets: tuple[str, ...]) -
     )
 
 
-def in_turn(parts: Sequence[Measurements]) -> list[Measurements]:
+def shift_overlapping_times(campaigns: Sequence[Measurements]) -> list[Measurements]:
     """The parts, the time of each after that of the one before where their clocks overlap."""
     out: list[Measurements] = []
     last = -np.inf
-    for part in parts:
+    for part in campaigns:
         time = part.columns.get("time", np.zeros(0)).astype(float)
         known = time[np.isfinite(time)]
         if len(known):
             late = float(last - known.min()) if known.min() <= last else 0.0
             last = float(known.max()) + late
-            part = part.everywhere(partial(later, seconds=late + 1.0)) if late else part
+            part = (
+                part.change_with_set_aside(partial(shift_measurement_time, seconds=late + 1.0))
+                if late
+                else part
+            )
         out.append(part)
     return out
 
 
-def later(part: Measurements, seconds: float) -> Measurements:
+def shift_measurement_time(part: Measurements, seconds: float) -> Measurements:
     """A part measured so much later [s]."""
     columns = {**part.columns, "time": part.columns["time"].astype(float) + seconds}
     return replace(part, columns=columns)

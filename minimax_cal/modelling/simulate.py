@@ -8,21 +8,24 @@ from pathlib import Path
 import numpy as np
 import scipy
 
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.options import check_seed, grouped
+from minimax_cal.core.arrays import Array
+from minimax_cal.core.errors import OptionError
+from minimax_cal.core.option_fields import check_seed, option_field_in_group
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.robots import kinematics
-from minimax_cal.robots.gravity import masses_of, torques
+from minimax_cal.robots.gravity_torques import joint_gravity_torques, link_masses_and_centres
+from minimax_cal.robots.joint_sampling import random_joint_values_above_floor
 from minimax_cal.robots.robot import Robot, load_robot
-from minimax_cal.robots.sampling import random_poses
-from minimax_cal.robots.transforms import transform
+from minimax_cal.robots.transforms import build_transform
 
-MOST_POSES, MOST_TARGETS = 1_000_000, 20
+MAX_SIMULATED_POSES, MAX_SIMULATED_TARGETS = 1_000_000, 20
 
 
-of_arm, of_instrument = grouped("The arm"), grouped("The instrument")
+arm_option_field, instrument_option_field = (
+    option_field_in_group("The arm"),
+    option_field_in_group("The instrument"),
+)
 
 
 @dataclass(frozen=True)
@@ -36,22 +39,24 @@ class Truth:
     span: most that a joint turns from 0, within its limits [rad].
     """
 
-    length: float = of_arm(
+    length: float = arm_option_field(
         0.5e-3, "The standard deviation of the errors of a and d.", "mm", flag="--length-error"
     )
-    angle: float = of_arm(
+    angle: float = arm_option_field(
         1.0e-3,
         "The standard deviation of the errors of theta, alpha, beta.",
         "mrad",
         flag="--angle-error",
     )
-    compliance: float = of_arm(
+    compliance: float = arm_option_field(
         3.0e-7, "How far each joint turns under gravity's torque.", "urad/Nm"
     )
-    noise: float = of_instrument(
+    noise: float = instrument_option_field(
         10e-6, "The standard deviation of a coordinate at the instrument.", "um"
     )
-    noise_per_metre: float = of_instrument(2.5e-6, "How that noise grows with range.", "um/m")
+    noise_per_metre: float = instrument_option_field(
+        2.5e-6, "How that noise grows with range.", "um/m"
+    )
     distance: float = 3.0
     circle: float = 0.1
     span: float = np.pi
@@ -100,10 +105,10 @@ def simulate(
     >>> data = mc.simulate("irb2600", 60, truth=mc.Truth(noise=20e-6)).data
     """
     robot = load_robot(robot)
-    if not (1 <= poses <= MOST_POSES and 1 <= targets <= MOST_TARGETS):
+    if not (1 <= poses <= MAX_SIMULATED_POSES and 1 <= targets <= MAX_SIMULATED_TARGETS):
         raise OptionError(
-            f"simulate needs at least one pose and one target, at most {MOST_POSES} and "
-            f"{MOST_TARGETS}"
+            f"simulate needs at least one pose and one target, at most {MAX_SIMULATED_POSES} and "
+            f"{MAX_SIMULATED_TARGETS}"
         )
     check_seed(seed)
     for name, value in vars(truth).items():
@@ -115,11 +120,11 @@ def simulate(
     real = robot.with_mdh(robot.mdh + errors)
     turn = scipy.spatial.transform.Rotation.random(rng=rng).as_matrix()
     aside = rng.normal(size=3)
-    base = transform(turn, truth.distance * aside / np.linalg.norm(aside))
+    base = build_transform(turn, truth.distance * aside / np.linalg.norm(aside))
     angle = 2.0 * np.pi * (np.arange(targets) + 0.3 * rng.uniform(size=targets)) / targets
     spots = np.stack([np.cos(angle), np.sin(angle), 0.3 + 0.0 * angle], axis=1) * truth.circle
     cell = Cell(real, base, tuple(f"smr{i + 1}" for i in range(targets)), spots)
-    q = random_poses(robot, poses, rng, truth.span)
+    q = random_joint_values_above_floor(robot, poses, rng, truth.span)
     y = cell.predict(q + truth.compliance * gravity(real, q))
     spread = truth.noise + truth.noise_per_metre * np.linalg.norm(y, axis=-1, keepdims=True)
     y = y + spread * rng.normal(size=y.shape)
@@ -138,6 +143,6 @@ def simulate(
 
 def gravity(robot: Robot, q: Array) -> Array:
     """(m, n) gravity torques of the drives, in the controller's sense [N m], masses told or not."""
-    links = kinematics.chain(robot.mdh, robot.turned(q), robot.prismatic)
-    bend = torques(links, *masses_of(robot), robot.up).T
-    return np.asarray(np.where(robot.prismatic, 0.0, bend) @ robot.turning)
+    links = kinematics.compute_link_frames(robot.mdh, robot.chain_joint_values(q), robot.prismatic)
+    bend = joint_gravity_torques(links, *link_masses_and_centres(robot), robot.up).T
+    return np.asarray(np.where(robot.prismatic, 0.0, bend) @ robot.joint_to_chain_matrix)

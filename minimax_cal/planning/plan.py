@@ -7,37 +7,78 @@ from pathlib import Path
 
 import numpy as np
 
-from minimax_cal.fitting.opened import Result
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.options import takes
-from minimax_cal.ground.stages import Progress, silent
+from minimax_cal.core.arrays import Array
+from minimax_cal.core.errors import OptionError
+from minimax_cal.core.option_fields import take_option_fields_as_keywords
+from minimax_cal.core.progress_stages import Progress, silent_progress
+from minimax_cal.fitting.opened_results import ResultOrFile
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.planning.candidates import Poses, candidates, near, rarest
-from minimax_cal.planning.designs.criteria import Criterion, inverse
-from minimax_cal.planning.designs.exchange import Menu, exchange, highest, polar
-from minimax_cal.planning.designs.search import ROUGH, Found, best_design, first_design, worth
-from minimax_cal.planning.options import PlanOptions, check_options, settings_of
-from minimax_cal.planning.outlook import grown, indices, remarks, separated
-from minimax_cal.planning.result import POWER, Plan, Travel
-from minimax_cal.planning.route import shortest, travel, visits
-from minimax_cal.planning.task import Task, ground_of, surroundings, task_of
-from minimax_cal.planning.visibility import Room, Sight
+from minimax_cal.planning.candidate_poses import (
+    CandidatePoses,
+    describe_main_rejection,
+    draw_candidates_near_poses,
+    draw_visible_candidates,
+)
+from minimax_cal.planning.designs.design_exchange import (
+    ExperimentPool,
+    find_largest_indices,
+    improve_design_by_exchange,
+    inverse_criterion_gradient,
+)
+from minimax_cal.planning.designs.design_search import (
+    ROUGH_EXCHANGE_SWEEPS,
+    DesignWithBound,
+    build_first_design,
+    equivalent_random_design_size,
+    search_best_design,
+)
+from minimax_cal.planning.designs.optimality_criteria import (
+    OptimalityCriterion,
+    invert_information_matrices,
+)
+from minimax_cal.planning.plan_options import PlanOptions, check_plan_options, plan_settings_record
+from minimax_cal.planning.plan_predictions import (
+    collect_plan_notices,
+    compare_observability_indices,
+    predict_accuracy_by_pose_count,
+    predict_effect_separation,
+)
+from minimax_cal.planning.planning_task import (
+    PlanningTask,
+    build_planning_inputs,
+    build_planning_task,
+    build_workspace_and_visibility,
+)
+from minimax_cal.planning.pose_visibility import ArmWorkspace, TrackerVisibility
+from minimax_cal.planning.result import SEPARATION_CRITERION, Plan, TravelLengths
+from minimax_cal.planning.visit_route import (
+    build_visit_sequence,
+    order_poses_for_short_path,
+    path_length,
+)
 from minimax_cal.robots.robot import Robot, load_robot
 
-STEPS = (0.2, 0.1, 0.05, 0.02)  # around the best so far, as a share of the joints' ranges
-AROUND, KEPT = 2400, 400  # poses tried around all of them, and those kept, each time
+REFINEMENT_STEP_FRACTIONS = (
+    0.2,
+    0.1,
+    0.05,
+    0.02,
+)  # around the best so far, as a share of the joints' ranges
+POSES_DRAWN_PER_REFINEMENT, POSES_KEPT_PER_REFINEMENT = (
+    2400,
+    400,
+)  # poses tried around all of them, and those kept, each time
 
 
-@takes(options=PlanOptions)
+@take_option_fields_as_keywords(options=PlanOptions)
 def plan(
     robot: Robot | str | Path,
     poses: int,
     *,
-    fit: Result | None = None,
+    fit: ResultOrFile | None = None,
     data: Measurements | str | Path | None = None,
     options: PlanOptions,
-    progress: Progress = silent,
+    progress: Progress = silent_progress,
 ) -> Plan:
     """Which poses of a robot to measure next, in which order, and how accurate they will make it.
 
@@ -72,117 +113,152 @@ def plan(
     """
     began = time.perf_counter()
     robot = load_robot(robot)
-    check_options(options, poses, robot)
+    check_plan_options(options, poses, robot)
     progress("start")
-    ground = ground_of(robot, "" if fit is None else fit, "" if data is None else data, options)
-    room, sight, said = surroundings(ground.cell, options, ground.measured)
+    ground = build_planning_inputs(
+        robot, "" if fit is None else fit, "" if data is None else data, options
+    )
+    room, sight, said = build_workspace_and_visibility(
+        ground.cell, options, ground.measurement_sets
+    )
     progress("candidate poses")
-    found = enough(room, sight, options, poses)
-    task = task_of(robot, ground, room, sight, found, options)
-    found, first = refined(task, found, poses, progress)
-    aim = task.aim(found)
-    best = best_design(*aim, first, progress)
+    found = draw_enough_candidates(room, sight, options, poses)
+    task = build_planning_task(robot, ground, room, sight, found, options)
+    found, first = refine_candidates_near_best(task, found, poses, progress)
+    aim = task.build_design_problem(found)
+    best = search_best_design(*aim, first, progress)
     progress("comparison")
-    notices = (*task.ground.notices, *said, *remarks(task, found))
-    return assembled(task, found, aim, best, notices, began)
+    notices = (*task.inputs.notices, *said, *collect_plan_notices(task, found))
+    return assemble_plan(task, found, aim, best, notices, began)
 
 
-def enough(room: Room, sight: Sight, options: PlanOptions, poses: int) -> Poses:
+def draw_enough_candidates(
+    workspace: ArmWorkspace, visibility: TrackerVisibility, options: PlanOptions, pose_count: int
+) -> CandidatePoses:
     """Candidates for so many poses.  Raises OptionError where there are fewer."""
-    found = candidates(room, sight, options.candidates, options.seed)
-    if found.count < poses:
+    found = draw_visible_candidates(workspace, visibility, options.candidates, options.seed)
+    if found.count < pose_count:
         raise OptionError(
-            f"only {found.count} of {found.tested} poses can be taken and seen, but {poses} are "
-            f"asked for; {rarest(found.rejected)}"
+            f"only {found.count} of {found.tested} poses can "
+            f"be taken and seen, but {pose_count} are "
+            f"asked for; {describe_main_rejection(found.rejected)}"
         )
     return found
 
 
-def refined(task: Task, found: Poses, poses: int, progress: Progress) -> tuple[Poses, Array]:
+def refine_candidates_near_best(
+    task: PlanningTask, candidates: CandidatePoses, pose_count: int, progress: Progress
+) -> tuple[CandidatePoses, Array]:
     """More candidates around those that tell most, and a first choice.
 
     Where poses that can be seen are rare, the best of a sequence lie inside of what is allowed;
     better ones lie at its edge.
     """
     progress("first poses")
-    menu, criterion = task.aim(found)
-    chosen = first_design(menu, criterion, poses, task.options.seed)
+    menu, criterion = task.build_design_problem(candidates)
+    chosen = build_first_design(menu, criterion, pose_count, task.options.seed)
     rng = np.random.default_rng(task.options.seed)
-    for step in STEPS:
+    for step in REFINEMENT_STEP_FRACTIONS:
         progress(f"poses within {100.0 * step:g} % around them")
-        each = -(-AROUND // poses)
-        more, seen = near(task.room, task.sight, found.q[chosen], each, step, rng)
-        menu, criterion = task.aim(found.join(more, seen))
-        cov = inverse(menu.of(chosen))
-        fresh = menu.scores(polar(cov, criterion.mix(cov)))[found.count :]
-        kept = np.sort(highest(fresh, KEPT))
-        old = found.count
-        found = found.join(more[kept], seen[kept])
-        menu = menu.take(np.concatenate([np.arange(old), old + kept]))
-        among = np.union1d(np.arange(old, menu.count), chosen)
-        chosen = exchange(menu, criterion, chosen, among, ROUGH).chosen
-    return found, chosen
+        each = -(-POSES_DRAWN_PER_REFINEMENT // pose_count)
+        more, seen = draw_candidates_near_poses(
+            task.workspace, task.visibility, candidates.q[chosen], each, step, rng
+        )
+        menu, criterion = task.build_design_problem(candidates.add_candidates(more, seen))
+        cov = invert_information_matrices(menu.sum_information(chosen))
+        fresh = menu.score_experiments(
+            inverse_criterion_gradient(cov, criterion.equivalent_trace_weight(cov))
+        )[candidates.count :]
+        kept = np.sort(find_largest_indices(fresh, POSES_KEPT_PER_REFINEMENT))
+        old = candidates.count
+        candidates = candidates.add_candidates(more[kept], seen[kept])
+        menu = menu.select_experiments(np.concatenate([np.arange(old), old + kept]))
+        among = np.union1d(np.arange(old, menu.experiment_count), chosen)
+        chosen = improve_design_by_exchange(
+            menu, criterion, chosen, among, ROUGH_EXCHANGE_SWEEPS
+        ).experiment_indices
+    return candidates, chosen
 
 
-def assembled(
-    task: Task,
-    found: Poses,
-    aim: tuple[Menu, Criterion],
-    best: Found,
+def assemble_plan(
+    task: PlanningTask,
+    candidates: CandidatePoses,
+    design_problem: tuple[ExperimentPool, OptimalityCriterion],
+    best: DesignWithBound,
     notices: tuple[str, ...],
-    began: float,
+    start_seconds: float,
 ) -> Plan:
-    """The plan, in a short order, compared with random poses.  began: by `time.perf_counter`."""
-    cell, options = task.ground.cell, task.options
-    robot, poses = cell.robot, len(best.design.chosen)
-    menu = task.menu(found)
-    chosen = ordered(best.design.chosen, found.q, robot)
-    q, seen = found.q[chosen], found.seen[chosen]
-    growth = grown(task, menu, aim, best, found.drawn)
+    """The plan, in a short order, compared with random poses.  start_seconds: by
+    `time.perf_counter`.
+    """
+    cell, options = task.inputs.cell, task.options
+    robot, poses = cell.robot, len(best.design.experiment_indices)
+    menu = task.build_parameter_pool(candidates)
+    chosen = order_poses_by_travel(best.design.experiment_indices, candidates.q, robot)
+    q, seen = candidates.q[chosen], candidates.seen[chosen]
+    growth = predict_accuracy_by_pose_count(task, menu, design_problem, best, candidates.drawn)
     here = next(row for row in growth if row.poses == poses)
-    stops = visits(
+    stops = build_visit_sequence(
         q,
         robot.prismatic,
-        task.room.lower,
-        task.room.upper,
+        task.workspace.lower,
+        task.workspace.upper,
         options.revisit,
-        aside=options.approach == "both",
+        from_other_side=options.approach == "both",
     )
     separation = tuple(
-        separated(one, contest, stops, seen[:, task.named(one)])
-        for one, contest in zip(task.asked, task.contests(found), strict=True)
+        predict_effect_separation(one, contest, stops, seen[:, task.find_target_indices(one)])
+        for one, contest in zip(
+            task.questions, task.predict_separation_powers(candidates), strict=True
+        )
     )
-    some = np.arange(found.drawn)
-    equal = worth(aim[0].take(some), aim[1], poses, best.design.size, options.seed)
+    some = np.arange(candidates.drawn)
+    equal = equivalent_random_design_size(
+        design_problem[0].select_experiments(some),
+        design_problem[1],
+        poses,
+        best.design.criterion_value,
+        options.seed,
+    )
 
     return Plan(
         cell=cell,
-        criterion=POWER if task.asked else options.criterion,
+        criterion=SEPARATION_CRITERION if task.questions else options.criterion,
         q=q,
         seen=seen,
         expected=np.where(seen[..., None], cell.predict(q), np.nan),
         visits=stops,
-        size=best.design.size,
-        bound=best.bound,
+        size=best.design.criterion_value,
+        bound=best.lower_bound,
         random=here.size[1],
         equal=equal,
-        names=task.ahead.names,
-        sigma=np.sqrt(np.diag(inverse(menu.of(chosen)))) / task.ahead.scale,
-        indices=indices(task.ahead, found, chosen, options.seed),
+        names=task.pose_information.names,
+        sigma=np.sqrt(np.diag(invert_information_matrices(menu.sum_information(chosen))))
+        / task.pose_information.parameter_scale,
+        indices=compare_observability_indices(
+            task.pose_information, candidates, chosen, options.seed
+        ),
         growth=growth,
         separation=separation,
-        candidates=found,
-        instrument=task.ground.instrument,
-        place=task.sight.place,
-        travel=Travel(*(travel(way, robot.prismatic) for way in (q, found.q[best.design.chosen]))),
-        at_hand=sum(one.poses for one in task.ground.measured),
-        settings=settings_of(options, poses),
+        candidates=candidates,
+        instrument=task.inputs.noise,
+        place=task.visibility.position,
+        travel=TravelLengths(
+            *(
+                path_length(way, robot.prismatic)
+                for way in (q, candidates.q[best.design.experiment_indices])
+            )
+        ),
+        at_hand=sum(one.poses for one in task.inputs.measurement_sets),
+        settings=plan_settings_record(options, poses),
         notices=notices,
-        seconds=time.perf_counter() - began,
+        seconds=time.perf_counter() - start_seconds,
     )
 
 
-def ordered(chosen: Array, q: Array, robot: Robot) -> Array:
+def order_poses_by_travel(pose_indices: Array, q: Array, robot: Robot) -> Array:
     """The chosen poses in a short order, from joint values 0 or as near as the limits let them."""
     home = np.clip(np.zeros(robot.joints), robot.lower, robot.upper)
-    return np.asarray(chosen[shortest(q[chosen], robot.prismatic, home)])
+    return np.asarray(
+        pose_indices[order_poses_for_short_path(q[pose_indices], robot.prismatic, home)]
+    )

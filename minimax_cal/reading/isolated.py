@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from contextlib import suppress
 from datetime import date, datetime, time
 
-MOST = 900 << 20  # bytes of memory; a sheet of 100 MB takes a third
-SECONDS = 120  # of the processor
+MAX_MEMORY_BYTES = 900 << 20  # bytes of memory; a sheet of 100 MB takes a third
+MAX_CPU_SECONDS = 120  # of the processor
 
 
-def limit_resources() -> None:
+def limit_process_resources() -> None:
     """Take no more than MOST and SECONDS, where the system lets that be limited.
 
     macOS refuses limits of address space; where one that is set already is lower, it stays.
@@ -21,17 +21,20 @@ def limit_resources() -> None:
         import resource
     except ImportError:  # Windows
         return
-    for kind, most in ((resource.RLIMIT_AS, MOST), (resource.RLIMIT_CPU, SECONDS)):
+    for kind, most in (
+        (resource.RLIMIT_AS, MAX_MEMORY_BYTES),
+        (resource.RLIMIT_CPU, MAX_CPU_SECONDS),
+    ):
         with suppress(ValueError, OSError):
             resource.setrlimit(kind, (most, most))
 
 
-def numbers_in(table: Sequence[Sequence[object]]) -> int:
+def count_number_cells(table: Sequence[Sequence[object]]) -> int:
     """How many cells are numbers."""
     return sum(isinstance(cell, int | float) for row in table for cell in row)
 
 
-def text_of(cell: object) -> str:
+def format_workbook_cell(cell: object) -> str:
     """A cell as text that reads back as the same value."""
     if isinstance(cell, bool):
         return str(cell).lower()
@@ -44,9 +47,9 @@ def text_of(cell: object) -> str:
     return " ".join(str(cell).split())
 
 
-def main(path: str) -> int:
+def print_workbook_sheet(path: str) -> int:
     """Print the sheet; 1 with what is wrong on stderr."""
-    limit_resources()
+    limit_process_resources()
     import python_calamine as calamine
 
     try:
@@ -55,14 +58,14 @@ def main(path: str) -> int:
     except Exception as error:  # the reader has no common class for what is no workbook
         print(f"is no workbook that can be read ({error})", file=sys.stderr)
         return 1
-    table = max(sheets, key=numbers_in) if sheets else []
-    if not numbers_in(table):
+    table = max(sheets, key=count_number_cells) if sheets else []
+    if not count_number_cells(table):
         print("no sheet of the workbook holds numbers", file=sys.stderr)
         return 1
     for row in table:
-        sys.stdout.buffer.write(("\t".join(map(text_of, row)) + "\n").encode())
+        sys.stdout.buffer.write(("\t".join(map(format_workbook_cell, row)) + "\n").encode())
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1]))
+    sys.exit(print_workbook_sheet(sys.argv[1]))

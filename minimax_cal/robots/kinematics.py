@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from minimax_cal.ground.arrays import Array
+from minimax_cal.core.arrays import Array
 from minimax_cal.robots.kernels import plain
-from minimax_cal.robots.kernels.choice import kernels, ready
+from minimax_cal.robots.kernels.kernel_choice import active_kernels, prepare_kernel_arrays
 from minimax_cal.robots.kernels.plain import ALPHA as ALPHA
 from minimax_cal.robots.kernels.plain import BETA as BETA
 from minimax_cal.robots.kernels.plain import THETA as THETA
@@ -25,7 +25,7 @@ MDH_NAMES = ("a", "d", "theta", "alpha", "beta")
 
 
 @dataclass(frozen=True, eq=False)
-class Chain:
+class LinkFrames:
     """Where every joint and link of the arm lies, at every pose, in the base frame.
 
     The pose is the last axis, so that sums over poses run through memory in order.
@@ -50,7 +50,7 @@ class Chain:
         return np.asarray(self.after[..., -1, :, :])
 
 
-def chain(mdh: Array, q: Array, prismatic: Array) -> Chain:
+def compute_link_frames(mdh: Array, q: Array, prismatic: Array) -> LinkFrames:
     """Axes and origins of all links [paper S, eq. 6-11].
 
     mdh: (..., n, 5) as a, d, theta, alpha, beta [m, rad].
@@ -58,18 +58,20 @@ def chain(mdh: Array, q: Array, prismatic: Array) -> Chain:
     prismatic: (n,) True where q moves along the joint axis.
     """
     if q.ndim == 2 and mdh.dtype == q.dtype == np.float64:
-        every = kernels().chain(*ready(mdh.reshape(-1, *mdh.shape[-2:]), q, prismatic))
+        every = active_kernels().link_axes_and_origins(
+            *prepare_kernel_arrays(mdh.reshape(-1, *mdh.shape[-2:]), q, prismatic)
+        )
         x, y, z, after, axes = (part.reshape(*mdh.shape[:-2], *part.shape[1:]) for part in every)
     else:
-        x, y, z, after, axes = plain.chain(mdh, q, prismatic)
+        x, y, z, after, axes = plain.link_axes_and_origins(mdh, q, prismatic)
     before = np.zeros_like(after)
     before[..., 1:, :, :] = after[..., :-1, :, :]
-    return Chain(x, y, z, before, after, axes)
+    return LinkFrames(x, y, z, before, after, axes)
 
 
-def forward(mdh: Array, q: Array, prismatic: Array) -> Array:
+def forward_kinematics(mdh: Array, q: Array, prismatic: Array) -> Array:
     """Pose of the last frame in the base: (..., m, 4, 4) [m].  Arguments as `chain`."""
-    links = chain(mdh, q, prismatic)
+    links = compute_link_frames(mdh, q, prismatic)
     *batch, _, _, m = links.axes.shape
     pose = np.zeros((*batch, m, 4, 4), dtype=links.axes.dtype)
     pose[..., :3, :3] = np.moveaxis(links.axes, -1, -3).swapaxes(-1, -2)
@@ -78,15 +80,15 @@ def forward(mdh: Array, q: Array, prismatic: Array) -> Array:
     return pose
 
 
-def points(links: Chain, targets: Array) -> Array:
+def targets_in_base(links: LinkFrames, targets: Array) -> Array:
     """Targets in the base frame: (..., k, 3, m) [m].
 
     targets: (..., k, 3) in the last frame [m].
     """
-    return plain.points(links.axes, links.origin, targets)
+    return plain.targets_in_base(links.axes, links.origin, targets)
 
 
-def screws(links: Chain) -> tuple[Array, Array]:
+def screw_axes_and_moments(links: LinkFrames) -> tuple[Array, Array]:
     """Axis w and moment o x w of all theta, then alpha, then beta: (..., 3n, 3, m) each.
 
     A point p moves by ``(o x w) - (p x w) = w x (p - o)`` per radian about the axis w through o.
@@ -96,64 +98,78 @@ def screws(links: Chain) -> tuple[Array, Array]:
     return axis, cross(through, axis)
 
 
-def hat(w: Array) -> Array:
-    """Skew matrix of w: hat(w) @ v = w x v.  w: (..., 3).  Returns (..., 3, 3)."""
-    out = np.zeros((*w.shape, 3), dtype=w.dtype)
+def skew_matrix(vector: Array) -> Array:
+    """Skew matrix of vector: hat(w) @ v = w x v.  vector: (..., 3).  Returns (..., 3, 3)."""
+    out = np.zeros((*vector.shape, 3), dtype=vector.dtype)
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        out[..., k, j], out[..., j, k] = w[..., i], -w[..., i]
+        out[..., k, j], out[..., j, k] = vector[..., i], -vector[..., i]
     return out
 
 
-def rotation(w: Array) -> Array:
-    """Rotation by the rotation vector w [rad] (Rodrigues).  w: (..., 3).  Returns (..., 3, 3)."""
-    squared = (w * w).sum(-1)[..., None, None]
+def rotation_from_vector(rotation_vectors: Array) -> Array:
+    """Rotation by the rotation vector w [rad] (Rodrigues).  rotation_vectors: (..., 3).  Returns
+    (..., 3, 3).
+    """
+    squared = (rotation_vectors * rotation_vectors).sum(-1)[..., None, None]
     small = np.real(squared) < 1e-8
     angle = np.sqrt(np.where(small, 1.0, squared))
     first = np.where(small, 1.0 - squared / 6.0, np.sin(angle) / angle)
     second = np.where(small, 0.5 - squared / 24.0, (1.0 - np.cos(angle)) / angle**2)
-    k = hat(w)
+    k = skew_matrix(rotation_vectors)
     return np.asarray(np.eye(3) + first * k + second * (k @ k))
 
 
-def right_jacobian(w: Array) -> Array:
-    """J with exp(w + dw) = exp(w) exp(J dw): (..., 3, 3).  w: (..., 3) rotation vectors [rad]."""
-    size = np.linalg.norm(w, axis=-1)[..., None, None]
+def so3_right_jacobian(rotation_vectors: Array) -> Array:
+    """J with exp(w + dw) = exp(w) exp(J dw): (..., 3, 3).  rotation_vectors: (..., 3) rotation
+    vectors [rad].
+    """
+    size = np.linalg.norm(rotation_vectors, axis=-1)[..., None, None]
     small = size < 1e-4  # where the quotients are their limits to rounding
     safe = np.where(small, 1.0, size)
     first = np.where(small, 0.5, (1.0 - np.cos(safe)) / safe**2)
     second = np.where(small, 1.0 / 6.0, (safe - np.sin(safe)) / safe**3)
-    skew = hat(w)
+    skew = skew_matrix(rotation_vectors)
     return np.asarray(np.eye(3) - first * skew + second * skew @ skew)
 
 
-def rotation_vector(turn: Array) -> Array:
-    """The rotation vector (3,) of a rotation (3, 3) [rad]: the inverse of `rotation`."""
-    v, w = along_quaternion(turn)
+def rotation_to_vector(rotation: Array) -> Array:
+    """The rotation vector (3,) of a rotation (3, 3) [rad]: the inverse of
+    `rotation_from_vector`.
+    """
+    v, w = rotation_to_unnormalised_quaternion(rotation)
     sine = float(np.linalg.norm(v))
     return np.asarray(v * (2.0 * np.arctan2(sine, w) / sine if sine > 0.0 else 0.0))
 
 
-def quaternion(turn: Array) -> Array:
+def rotation_to_quaternion(rotation: Array) -> Array:
     """The unit quaternion (4,) of a rotation (3, 3): w, x, y, z with w not negative."""
-    v, w = along_quaternion(turn)
+    v, w = rotation_to_unnormalised_quaternion(rotation)
     every = np.array([w, *v])
     return np.asarray(every / np.linalg.norm(every))
 
 
-def along_quaternion(turn: Array) -> tuple[Array, float]:
+def rotation_to_unnormalised_quaternion(rotation: Array) -> tuple[Array, float]:
     """Vector (3,) and scalar of the quaternion of a rotation (3, 3), of any length.
 
     From its largest entry [Shepperd 1978].
     """
-    square = np.append(np.diag(turn), np.trace(turn))  # 4 x^2 ... 4 w^2, alike up to a constant
+    square = np.append(
+        np.diag(rotation), np.trace(rotation)
+    )  # 4 x^2 ... 4 w^2, alike up to a constant
     largest = int(np.argmax(square))
     if largest == 3:
-        w = 1.0 + np.trace(turn)
-        v = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+        w = 1.0 + np.trace(rotation)
+        v = np.array(
+            [
+                rotation[2, 1] - rotation[1, 2],
+                rotation[0, 2] - rotation[2, 0],
+                rotation[1, 0] - rotation[0, 1],
+            ]
+        )
     else:
         i, j, k = largest, (largest + 1) % 3, (largest + 2) % 3
         v = np.empty(3)
-        v[i] = 1.0 + turn[i, i] - turn[j, j] - turn[k, k]
-        v[j], v[k] = turn[j, i] + turn[i, j], turn[k, i] + turn[i, k]
-        w = turn[k, j] - turn[j, k]
+        v[i] = 1.0 + rotation[i, i] - rotation[j, j] - rotation[k, k]
+        v[j], v[k] = rotation[j, i] + rotation[i, j], rotation[k, i] + rotation[i, k]
+        w = rotation[k, j] - rotation[j, k]
     return (-v, -float(w)) if w < 0.0 else (v, float(w))

@@ -17,53 +17,68 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import CalibrationWarning, RobotError
-from minimax_cal.ground.files import json_text, once, read_text, write_whole
-from minimax_cal.ground.units import in_mm
-from minimax_cal.reading.workbook import SUFFIXES
-from minimax_cal.robots import couplings, kinematics, notation
-from minimax_cal.robots.angle_units import check_angles, check_limits
-from minimax_cal.robots.inverse import NEAR, at_poses, missing, nearest
+from minimax_cal.core.arrays import Array
+from minimax_cal.core.errors import CalibrationWarning, RobotError
+from minimax_cal.core.files import (
+    build_object_with_unique_keys,
+    format_json,
+    read_text,
+    write_file_atomically,
+)
+from minimax_cal.core.units import metres_to_file_mm
+from minimax_cal.reading.workbook import WORKBOOK_SUFFIXES
+from minimax_cal.robots import dh_notation, joint_couplings, kinematics
+from minimax_cal.robots.angle_units import check_joint_limit_unit, check_link_angle_unit
+from minimax_cal.robots.dh_notation import DH_FORMULAS, STANDARD_NOTATION, DhNotation
+from minimax_cal.robots.inverse_kinematics import (
+    MAX_REACHED_RESIDUAL,
+    pose_residual_and_jacobian,
+    solve_joints_with_restarts,
+    solve_nearest_joints,
+)
 from minimax_cal.robots.kinematics import MDH_NAMES
-from minimax_cal.robots.notation import FORMULAS, PLAIN, Notation
-from minimax_cal.robots.transforms import tail
+from minimax_cal.robots.transforms import a_alpha_beta_transform
 
-CONVENTION = FORMULAS["standard"]
-METRES = {"mm": 1e-3, "m": 1.0}
-RADIANS = {"rad": 1.0, "deg": np.pi / 180.0}
+STANDARD_DH_FORMULA = DH_FORMULAS["standard"]
+METRES_PER_UNIT = {"mm": 1e-3, "m": 1.0}
+RADIANS_PER_UNIT = {"rad": 1.0, "deg": np.pi / 180.0}
 
-DRAWN_WITHIN = (0.3e-3, 0.5e-3)  # sigmas of a length and of an angle of most drawings [m, rad]
+DEFAULT_NOMINAL_SIGMAS = (
+    0.3e-3,
+    0.5e-3,
+)  # sigmas of a length and of an angle of most drawings [m, rad]
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-LEVER = 0.1  # of the reach: what a radian counts as
-TURNING = 1e-6  # how far a rotation may be from one
-LONGEST, TURNED = 1e3, 1e3  # no link is longer, no angle larger than this [m, rad]
+INVERSE_LEVER_PER_REACH = 0.1  # of the reach: what a radian counts as
+MAX_ROTATION_ERROR = 1e-6  # how far a rotation may be from one
+MAX_LINK_LENGTH, MAX_LINK_ANGLE = 1e3, 1e3  # no link is longer, no angle larger than this [m, rad]
 Vector = tuple[Finite, Finite, Finite]
 Inertia = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
 
 
-def turning(ratio: float) -> float:
+def check_gear_ratio(ratio: float) -> float:
     """A gear ratio; zero is none.  Raises ValueError."""
     if ratio == 0.0:
         raise ValueError("a gear ratio of zero turns nothing; leave the key out")
     return ratio
 
 
-FREE = ("x_", "source", "note")  # how keys begin that a robot file may hold for people
+NOTE_KEY_PREFIXES = ("x_", "source", "note")  # how keys begin that a robot file may hold for people
 
 
-def only_known(known: Collection[str], given: object, free: tuple[str, ...] = ()) -> object:
+def check_known_keys(
+    known_keys: Collection[str], content: object, note_prefixes: tuple[str, ...] = ()
+) -> object:
     """Keys of a part of a file, if all are known or free.  Raises ValueError with the nearest."""
-    for key in map(str, given if isinstance(given, Mapping) else ()):
-        if key not in known and not (free and key.startswith(free)):
-            (near,) = difflib.get_close_matches(key, known, 1, cutoff=0.0)
-            more = "; begin a note of your own with x_, source or note" if free else ""
+    for key in map(str, content if isinstance(content, Mapping) else ()):
+        if key not in known_keys and not (note_prefixes and key.startswith(note_prefixes)):
+            (near,) = difflib.get_close_matches(key, known_keys, 1, cutoff=0.0)
+            more = "; begin a note of your own with x_, source or note" if note_prefixes else ""
             raise ValueError(f"unknown key {key[:60]!r}; did you mean {near!r}?{more}")
-    return given
+    return content
 
 
-class Strict(BaseModel):
+class StrictSchema(BaseModel):
     """A part of a robot file: what is not known would be ignored in silence, and is refused."""
 
     model_config = ConfigDict(extra="forbid")
@@ -71,19 +86,19 @@ class Strict(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def no_slip(cls, given: object) -> object:
+    def check_no_unknown_keys(cls, content: object) -> object:
         """The keys, if all are known.  Raises ValueError with the nearest."""
-        return only_known(cls.model_fields, given, cls.notes)
+        return check_known_keys(cls.model_fields, content, cls.notes)
 
 
-class UnitsSchema(Strict):
+class UnitsSchema(StrictSchema):
     """Units of a robot file."""
 
     length: Literal["mm", "m"]
     angle: Literal["rad", "deg"]
 
 
-class JointSchema(Strict):
+class JointSchema(StrictSchema):
     """One joint of a robot file, in the file's units."""
 
     a: Finite
@@ -96,7 +111,7 @@ class JointSchema(Strict):
     type: Literal["revolute", "prismatic"] = "revolute"
     lower: Finite | None = None
     upper: Finite | None = None
-    ratio: Annotated[Finite, AfterValidator(turning)] | None = None
+    ratio: Annotated[Finite, AfterValidator(check_gear_ratio)] | None = None
     mass_kg: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] | None = None
     com_mm: Vector | None = None
     inertia: Inertia | None = None
@@ -104,7 +119,7 @@ class JointSchema(Strict):
     name: str = ""
 
 
-class EndSchema(Strict):
+class EndSchema(StrictSchema):
     """What follows the last joint of modified DH, as the a, alpha and beta of a next row."""
 
     a: Finite = 0.0
@@ -112,27 +127,27 @@ class EndSchema(Strict):
     beta: Finite = 0.0
 
 
-class WithinSchema(Strict):
+class WithinSchema(StrictSchema):
     """How well the drawing is known: standard deviations of its lengths and of its angles."""
 
     mm: Annotated[float, Field(gt=0.0, lt=100.0)] = 0.3
     mrad: Annotated[float, Field(gt=0.0, lt=100.0)] = 0.5
 
 
-class RobotSchema(Strict):
-    """A robot file.  Keys that begin as `FREE` says are notes; others are refused."""
+class RobotSchema(StrictSchema):
+    """A robot file.  Keys that begin as `NOTE_KEY_PREFIXES` says are notes; others are refused."""
 
     model_config = ConfigDict(
         extra="ignore",
         json_schema_extra={
-            "patternProperties": {f"^({'|'.join(FREE)})": {}},
+            "patternProperties": {f"^({'|'.join(NOTE_KEY_PREFIXES)})": {}},
             "additionalProperties": False,
         },
     )
-    notes = FREE
+    notes = NOTE_KEY_PREFIXES
 
     name: str
-    convention: str = CONVENTION
+    convention: str = STANDARD_DH_FORMULA
     units: UnitsSchema
     joints: Annotated[list[JointSchema], Field(min_length=1)]
     coupling: dict[str, dict[str, Finite]] | list[list[Finite]] | None = None
@@ -180,9 +195,9 @@ class Robot:
     rough: bool = False
     inertia: Array = field(default_factory=lambda: np.zeros((0, 6)))
     drive_gain: Array = field(default_factory=lambda: np.zeros(0))
-    drawn_within: tuple[float, float] = DRAWN_WITHIN
+    drawn_within: tuple[float, float] = DEFAULT_NOMINAL_SIGMAS
     coupling: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    notation: Notation = PLAIN
+    notation: DhNotation = STANDARD_NOTATION
     notices: tuple[str, ...] = ()
 
     @property
@@ -198,18 +213,18 @@ class Robot:
         return np.asarray(~self.coupling.any(axis=0))
 
     @property
-    def turning(self) -> Array:
+    def joint_to_chain_matrix(self) -> Array:
         """(n, n) how the joints turn or slide in the chain per unit of each joint value."""
         own = self.coupling if len(self.coupling) else np.eye(self.joints)
         return np.asarray(self.sign[:, None] * own)
 
-    def turned(self, q: Array) -> Array:
+    def chain_joint_values(self, q: Array) -> Array:
         """Joint values (..., n) as the chain takes them: couplings and signs applied."""
         return np.asarray((q @ self.coupling.T if len(self.coupling) else q) * self.sign)
 
-    def commanded(self, turned: Array) -> Array:
-        """The joint values (..., n) of those in the chain: the inverse of `turned`."""
-        own = turned * self.sign
+    def controller_joint_values(self, chain_values: Array) -> Array:
+        """The joint values (..., n) of those in the chain: the inverse of `chain_values`."""
+        own = chain_values * self.sign
         return np.asarray(own @ np.linalg.pinv(self.coupling).T if len(self.coupling) else own)
 
     def pose(self, q: Array) -> Array:
@@ -217,17 +232,19 @@ class Robot:
 
         Raises RobotError for joint values of another arm.
         """
-        q = self.own_joints(q)
+        q = self.check_joint_values(q)
         flat = q.reshape(-1, self.joints)
-        pose = kinematics.forward(self.mdh, self.turned(flat), self.prismatic)
+        pose = kinematics.forward_kinematics(
+            self.mdh, self.chain_joint_values(flat), self.prismatic
+        )
         return pose.reshape(*q.shape[:-1], 4, 4)
 
-    def own_joints(self, q: Array) -> Array:
+    def check_joint_values(self, q: Array) -> Array:
         """Joint values (..., n), if they are of so many joints, or of those with a drive.
 
         Raises RobotError.
         """
-        q = couplings.whole(np.asarray(q), self.passive)
+        q = joint_couplings.insert_passive_joint_zeros(np.asarray(q), self.passive)
         if not q.ndim or q.shape[-1] != self.joints:
             raise RobotError(
                 f"{self.name} has {self.joints} joints: joint values must be (..., {self.joints}), "
@@ -242,19 +259,23 @@ class Robot:
         ways of the arm [rad, m]; without it any way will do.  What cannot be reached ends nearby,
         with a CalibrationWarning.  Raises RobotError for what is no pose.
         """
-        lever = LEVER * self.reach()
+        lever = INVERSE_LEVER_PER_REACH * self.reach()
 
         def find(goal: Array, begin: Array) -> tuple[Array, Array]:
             def look(rows: Array, q: Array) -> tuple[Array, Array]:
-                turned, turning = self.turned(q), self.turning
-                return missing(self.mdh, turned, self.prismatic, turning, goal[rows], lever)
+                turned, turning = self.chain_joint_values(q), self.joint_to_chain_matrix
+                return pose_residual_and_jacobian(
+                    self.mdh, turned, self.prismatic, turning, goal[rows], lever
+                )
 
             box = (np.broadcast_to(end, begin.shape) for end in (self.lower, self.upper))
-            q = nearest(look, begin, *box)
+            q = solve_nearest_joints(look, begin, *box)
             return q, np.linalg.norm(look(np.arange(len(q)), q)[0], axis=1)
 
-        given = checked_poses(pose, near, self.joints)
-        return told_missing(*at_poses(find, *given, self.lower, self.upper))
+        given = check_poses_and_start(pose, near, self.joints)
+        return warn_of_unreached_poses(
+            *solve_joints_with_restarts(find, *given, self.lower, self.upper)
+        )
 
     def reach(self) -> float:
         """Length of the stretched arm without its slides, at least 0.1: a scale for errors [m]."""
@@ -267,7 +288,7 @@ class Robot:
 
     def to_dict(self) -> dict[str, Any]:
         """The robot in the file schema and the convention of its file, in mm and radians."""
-        rows, end = self.notation.written(self.mdh, self.prismatic)
+        rows, end = self.notation.rows_in_file_convention(self.mdh, self.prismatic)
         sign = self.sign.copy()
         sign[0] *= -1.0 if self.notation.half_turn else 1.0
 
@@ -282,7 +303,9 @@ class Robot:
                 "ratio": self.ratio[i],
                 "mass_kg": self.mass[i],
             }
-            out: dict[str, Any] = dict(a=in_mm(a), d=in_mm(d), theta=theta, alpha=alpha, beta=beta)
+            out: dict[str, Any] = dict(
+                a=metres_to_file_mm(a), d=metres_to_file_mm(d), theta=theta, alpha=alpha, beta=beta
+            )
             out["sign"] = int(sign[i])
             if self.prismatic[i]:
                 out["type"] = "prismatic"
@@ -290,42 +313,46 @@ class Robot:
             if np.all(np.isfinite(self.com[i])):
                 com = self.com[i]
                 if self.notation.modified:  # of the frame of joint i, which lies before the link
-                    rest = tail(self.notation.told(self.mdh, self.prismatic)[i])
+                    rest = a_alpha_beta_transform(
+                        self.notation.values_in_file_convention(self.mdh, self.prismatic)[i]
+                    )
                     com = rest[:3, :3] @ com + rest[:3, 3]
-                out["com_mm"] = [in_mm(c) for c in com]
+                out["com_mm"] = [metres_to_file_mm(c) for c in com]
             if len(self.inertia) and np.all(np.isfinite(self.inertia[i])):
-                out["inertia"] = [float(c) for c in self.inertia_in_file(i)]
+                out["inertia"] = [float(c) for c in self.inertia_in_file_axes(i)]
             if len(self.drive_gain) and np.isfinite(self.drive_gain[i]):
                 out["drive_gain"] = float(self.drive_gain[i])
             return out
 
         known = np.isfinite(self.repeatability)
-        coupling = couplings.to_dict(self.coupling)
+        coupling = joint_couplings.coupling_to_dict(self.coupling)
         within = dict(zip(("mm", "mrad"), (1e3 * each for each in self.drawn_within), strict=True))
-        after = dict(a=in_mm(end[0]), alpha=end[3], beta=end[4])
+        after = dict(a=metres_to_file_mm(end[0]), alpha=end[3], beta=end[4])
         return {
             "name": self.name,
-            "convention": "modified" if self.notation.modified else CONVENTION,
+            "convention": "modified" if self.notation.modified else STANDARD_DH_FORMULA,
             "units": {"length": "mm", "angle": "rad"},
             "up": [float(u) for u in self.up],
             **({"repeatability_mm": 1e3 * self.repeatability} if known else {}),
             **({"nominal": "rough"} if self.rough else {}),
-            **({"drawn_within": within} if self.drawn_within != DRAWN_WITHIN else {}),
+            **({"drawn_within": within} if self.drawn_within != DEFAULT_NOMINAL_SIGMAS else {}),
             **({"coupling": coupling} if coupling else {}),
             **({"flange": {k: float(v) for k, v in after.items()}} if end.any() else {}),
             "joints": [joint(i) for i in range(self.joints)],
         }
 
-    def inertia_in_file(self, i: int) -> Array:
+    def inertia_in_file_axes(self, link_index: int) -> Array:
         """(6,) of link i, in the axes of the file's own frame i."""
         if not self.notation.modified:
-            return np.asarray(self.inertia[i])
-        rest = tail(self.notation.told(self.mdh, self.prismatic)[i])
-        return in_other_axes(self.inertia[i], rest[:3, :3])
+            return np.asarray(self.inertia[link_index])
+        rest = a_alpha_beta_transform(
+            self.notation.values_in_file_convention(self.mdh, self.prismatic)[link_index]
+        )
+        return rotate_inertia(self.inertia[link_index], rest[:3, :3])
 
     def save(self, path: Path | str) -> None:
         """Write the robot as JSON."""
-        write_whole(path, json_text(self.to_dict()))
+        write_file_atomically(path, format_json(self.to_dict()))
 
     def with_mdh(self, mdh: Array) -> Robot:
         """The same robot with another geometry (n, 5).  Raises RobotError for another shape."""
@@ -335,34 +362,41 @@ class Robot:
         return replace(self, mdh=new)
 
 
-def checked_poses(pose: Array, near: Array | None, joints: int) -> tuple[Array, Array | None]:
+def check_poses_and_start(
+    poses: Array, near_joints: Array | None, joint_count: int
+) -> tuple[Array, Array | None]:
     """Poses (..., 4, 4) and joints to start from, if they are some.  Raises RobotError."""
     try:
-        pose = np.asarray(pose, dtype=float)
-        near = None if near is None else np.asarray(near, dtype=float)
+        poses = np.asarray(poses, dtype=float)
+        near_joints = None if near_joints is None else np.asarray(near_joints, dtype=float)
     except (TypeError, ValueError) as error:
         raise RobotError("inverse: pose and near must be numbers") from error
-    if pose.shape[-2:] != (4, 4) or not np.isfinite(pose).all():
-        raise RobotError(f"inverse: pose must be finite, of shape (..., 4, 4); it is {pose.shape}")
-    turn = pose[..., :3, :3]
+    if poses.shape[-2:] != (4, 4) or not np.isfinite(poses).all():
+        raise RobotError(f"inverse: pose must be finite, of shape (..., 4, 4); it is {poses.shape}")
+    turn = poses[..., :3, :3]
     apart = np.abs(turn @ np.swapaxes(turn, -1, -2) - np.eye(3)).max(initial=0.0)
-    if apart > TURNING or np.any(np.linalg.det(turn) < 0.0):
+    if apart > MAX_ROTATION_ERROR or np.any(np.linalg.det(turn) < 0.0):
         raise RobotError("inverse: the upper left 3 x 3 of a pose must be a rotation")
-    if near is not None:
-        fits = near.shape[-1:] == (joints,) and near.shape[:-1] in ((), pose.shape[:-2])
-        if not (fits and np.isfinite(near).all()):
+    if near_joints is not None:
+        fits = near_joints.shape[-1:] == (joint_count,) and near_joints.shape[:-1] in (
+            (),
+            poses.shape[:-2],
+        )
+        if not (fits and np.isfinite(near_joints).all()):
             raise RobotError(
-                f"inverse: near must be finite, of shape ({joints},) or a row for each pose; it is "
-                f"{near.shape}"
+                f"inverse: near must be finite, of shape ({joint_count}"
+                f",) or a row for each pose; it is "
+                f"{near_joints.shape}"
             )
-    return pose, near
+    return poses, near_joints
 
 
-def told_missing(q: Array, left: Array) -> Array:
+def warn_of_unreached_poses(q: Array, residuals: Array) -> Array:
     """The joints found; a CalibrationWarning where they do not reach their poses."""
-    if count := int(np.count_nonzero(left > NEAR)):
+    if count := int(np.count_nonzero(residuals > MAX_REACHED_RESIDUAL)):
         warnings.warn(
-            f"{count} of {left.size} poses are not reached, by {1e3 * left.max():.3g} mm at worst: "
+            f"{count} of {residuals.size} poses are not reached, "
+            f"by {1e3 * residuals.max():.3g} mm at worst: "
             "out of reach, beyond a limit, or another way of the arm (near)",
             CalibrationWarning,
             stacklevel=3,
@@ -375,32 +409,36 @@ def robot_from_dict(content: Mapping[str, Any], source: str = "robot") -> Robot:
     try:
         schema = RobotSchema.model_validate(content)
     except ValidationError as error:
-        raise RobotError(f"{source}: {explain(error)}") from error
-    modified = is_modified(schema, source)
-    metre, radian = METRES[schema.units.length], RADIANS[schema.units.angle]
+        raise RobotError(f"{source}: {format_validation_error(error)}") from error
+    modified = is_modified_dh(schema, source)
+    metre, radian = METRES_PER_UNIT[schema.units.length], RADIANS_PER_UNIT[schema.units.angle]
     joints = schema.joints
     prismatic = np.array([joint.type == "prismatic" for joint in joints])
     unit, scale = np.where(prismatic, metre, radian), np.array([metre, metre, *[radian] * 3])
-    mdh = rows_of(schema, scale, source)
-    lower, upper = limits_of(schema, prismatic, unit, source)
-    coupling = couplings.read(schema.coupling, [j.name for j in joints], source)
+    mdh = build_link_rows(schema, scale, source)
+    lower, upper = build_joint_limits(schema, prismatic, unit, source)
+    coupling = joint_couplings.build_coupling_matrix(
+        schema.coupling, [j.name for j in joints], source
+    )
     passive = ~coupling.any(axis=0) if len(coupling) else np.zeros(len(joints), dtype=bool)
     sign = np.array([float(j.sign) for j in joints])
     offset = np.array([j.offset for j in joints]) * unit
     offset = offset if offset.any() else np.zeros(0)
     com = np.array([[np.nan] * 3 if j.com_mm is None else j.com_mm for j in joints]) * 1e-3
-    inertia = where_given([j.inertia for j in joints], [np.nan] * 6)
+    inertia = build_array_unless_missing([j.inertia for j in joints], [np.nan] * 6)
     if modified:
         end = schema.flange or EndSchema()
         after = np.array([end.a, 0.0, 0.0, end.alpha, end.beta]) * scale
-        com = before_links(com, np.vstack([mdh[1:], after]))
-        turns = [tail(row)[:3, :3].T for row in np.vstack([mdh[1:], after])]
-        inertia = np.array([in_other_axes(*two) for two in zip(inertia, turns, strict=False)])
+        com = convert_centres_to_engine_frames(com, np.vstack([mdh[1:], after]))
+        turns = [a_alpha_beta_transform(row)[:3, :3].T for row in np.vstack([mdh[1:], after])]
+        inertia = np.array([rotate_inertia(*two) for two in zip(inertia, turns, strict=False)])
         inertia = inertia.reshape(-1, 6)
-        mdh, sign, said = notation.read(mdh, sign, prismatic, offset, after, source)
+        mdh, sign, said = dh_notation.convert_modified_rows(
+            mdh, sign, prismatic, offset, after, source
+        )
     else:
-        mdh, sign = notation.straight(mdh, sign, prismatic, offset, False)
-        said = Notation(offset=offset) if len(offset) else PLAIN
+        mdh, sign = dh_notation.apply_offsets_and_half_turn(mdh, sign, prismatic, offset, False)
+        said = DhNotation(offset=offset) if len(offset) else STANDARD_NOTATION
     return Robot(
         name=schema.name,
         mdh=mdh,
@@ -408,38 +446,46 @@ def robot_from_dict(content: Mapping[str, Any], source: str = "robot") -> Robot:
         prismatic=prismatic,
         lower=np.where(passive, 0.0, lower),
         upper=np.where(passive, 0.0, upper),
-        ratio=optional([j.ratio for j in joints], np.nan),
-        mass=optional([j.mass_kg for j in joints], np.nan),
+        ratio=fill_missing_numbers([j.ratio for j in joints], np.nan),
+        mass=fill_missing_numbers([j.mass_kg for j in joints], np.nan),
         com=com,
-        up=vertical(schema, source),
+        up=build_up_vector(schema, source),
         repeatability=1e-3 * (schema.repeatability_mm or math.nan),
         rough=schema.nominal == "rough",
         drawn_within=(1e-3 * schema.drawn_within.mm, 1e-3 * schema.drawn_within.mrad),
         inertia=inertia,
-        drive_gain=where_given([j.drive_gain for j in joints], np.nan),
+        drive_gain=build_array_unless_missing([j.drive_gain for j in joints], np.nan),
         coupling=coupling,
         notation=said,
     )
 
 
-def optional(values: list[float | None], default: float) -> Array:
+def fill_missing_numbers(values: list[float | None], default: float) -> Array:
     """Numbers (n,), a default where there is none."""
     return np.array([default if value is None else value for value in values], dtype=float)
 
 
-def where_given(values: list[Any], unknown: Any) -> Array:
-    """Numbers or rows (n, ...), `unknown` where there is none; (0, ...) where there are none."""
+def build_array_unless_missing(values: list[Any], fill_value: Any) -> Array:
+    """Numbers or rows (n, ...), `fill_value` where there is none; (0, ...) where there are none."""
     if all(value is None for value in values):
-        return np.zeros((0, *np.shape(unknown)))
-    return np.array([unknown if value is None else value for value in values], dtype=float)
+        return np.zeros((0, *np.shape(fill_value)))
+    return np.array([fill_value if value is None else value for value in values], dtype=float)
 
 
-def rows_of(schema: RobotSchema, scale: Array, source: str) -> Array:
-    """The links (n, 5) as a file has them.  scale: (5,) its units [m, rad].  Raises RobotError."""
+def build_link_rows(schema: RobotSchema, unit_scales: Array, source: str) -> Array:
+    """The links (n, 5) as a file has them.  unit_scales: (5,) its units [m, rad].  Raises
+    RobotError.
+    """
     mdh = np.array([[j.a, j.d, j.theta, j.alpha, j.beta] for j in schema.joints])
-    check_angles(mdh[:, 2:], schema.units.angle, source)
-    mdh = mdh * scale
-    huge = np.abs(mdh) > [LONGEST, LONGEST, TURNED, TURNED, TURNED]
+    check_link_angle_unit(mdh[:, 2:], schema.units.angle, source)
+    mdh = mdh * unit_scales
+    huge = np.abs(mdh) > [
+        MAX_LINK_LENGTH,
+        MAX_LINK_LENGTH,
+        MAX_LINK_ANGLE,
+        MAX_LINK_ANGLE,
+        MAX_LINK_ANGLE,
+    ]
     if huge.any():
         joint, column = np.argwhere(huge)[0]
         raise RobotError(
@@ -448,20 +494,20 @@ def rows_of(schema: RobotSchema, scale: Array, source: str) -> Array:
     return np.asarray(mdh)
 
 
-def limits_of(
-    schema: RobotSchema, prismatic: Array, unit: Array, source: str
+def build_joint_limits(
+    schema: RobotSchema, prismatic: Array, joint_units: Array, source: str
 ) -> tuple[Array, Array]:
     """Lower and upper limits (n,), infinite where unknown [rad, m].  Raises RobotError."""
-    lower = optional([j.lower for j in schema.joints], -np.inf)
-    upper = optional([j.upper for j in schema.joints], np.inf)
-    check_limits(lower, upper, prismatic, schema.units.angle, source)
+    lower = fill_missing_numbers([j.lower for j in schema.joints], -np.inf)
+    upper = fill_missing_numbers([j.upper for j in schema.joints], np.inf)
+    check_joint_limit_unit(lower, upper, prismatic, schema.units.angle, source)
     if np.any(lower >= upper):
         number = int(np.argmax(lower >= upper)) + 1
         raise RobotError(f"{source}: joint {number}: lower must be less than upper")
-    return lower * unit, upper * unit
+    return lower * joint_units, upper * joint_units
 
 
-def vertical(schema: RobotSchema, source: str) -> Array:
+def build_up_vector(schema: RobotSchema, source: str) -> Array:
     """(3,) the unit vector upwards in the base frame.  Raises RobotError."""
     up = np.array(schema.up)
     up = up / max(1.0, float(np.abs(up).max()))  # the squares of huge numbers are none
@@ -470,10 +516,10 @@ def vertical(schema: RobotSchema, source: str) -> Array:
     return np.asarray(up / np.linalg.norm(up))
 
 
-def is_modified(schema: RobotSchema, source: str) -> bool:
+def is_modified_dh(schema: RobotSchema, source: str) -> bool:
     """Whether a file's rows are Craig's.  Raises RobotError for a convention that is not known."""
     given = "".join(schema.convention.split()).lower()
-    for name, formula in FORMULAS.items():
+    for name, formula in DH_FORMULAS.items():
         if given in (name, "".join(formula.split()).lower()):
             if schema.flange and name == "standard":
                 raise RobotError(
@@ -483,28 +529,28 @@ def is_modified(schema: RobotSchema, source: str) -> bool:
             return name == "modified"
     raise RobotError(
         f"{source}: convention {schema.convention!r} is not known; use 'standard' "
-        f"({FORMULAS['standard']}) or 'modified' (Craig's: {FORMULAS['modified']})"
+        f"({DH_FORMULAS['standard']}) or 'modified' (Craig's: {DH_FORMULAS['modified']})"
     )
 
 
-def in_other_axes(inertia: Array, turn: Array) -> Array:
+def rotate_inertia(inertia: Array, rotation: Array) -> Array:
     """An inertia (6,) xx, xy, xz, yy, yz, zz in axes that a rotation (3, 3) leads into."""
     at = np.triu_indices(3)
     whole = np.zeros((3, 3))
     whole[at] = whole.T[at] = inertia
-    return np.asarray((turn @ whole @ turn.T)[at])
+    return np.asarray((rotation @ whole @ rotation.T)[at])
 
 
-def before_links(com: Array, rows: Array) -> Array:
+def convert_centres_to_engine_frames(centres: Array, next_rows: Array) -> Array:
     """Centres of gravity (n, 3), given in the frames of Craig's joints, in the engine's frames.
 
-    rows: (n, 5) the row after each joint [m, rad].
+    next_rows: (n, 5) the row after each joint [m, rad].
     """
-    parts = [tail(row) for row in rows]
-    return np.array([t[:3, :3].T @ (c - t[:3, 3]) for t, c in zip(parts, com, strict=True)])
+    parts = [a_alpha_beta_transform(row) for row in next_rows]
+    return np.array([t[:3, :3].T @ (c - t[:3, 3]) for t, c in zip(parts, centres, strict=True)])
 
 
-def explain(error: ValidationError) -> str:
+def format_validation_error(error: ValidationError) -> str:
     """The first complaint of the schema, in one line: where and what."""
     first = error.errors(include_url=False)[0]
     place = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"])
@@ -526,7 +572,7 @@ def builtin_robots() -> tuple[str, ...]:
 
 
 @cache
-def builtin_robot(name: str) -> Robot:
+def load_builtin_robot(name: str) -> Robot:
     """A built-in robot, read once: its arrays cannot be changed."""
     builtin = resources.files("minimax_cal.robots") / "builtin" / f"{name}.json"
     robot = robot_from_dict(json.loads(builtin.read_text("utf-8")), name)
@@ -536,18 +582,21 @@ def builtin_robot(name: str) -> Robot:
     return robot
 
 
-def written_out(text: str) -> Any:
+def parse_yaml_text(text: str) -> Any:
     """A YAML document without aliases.  Raises ValueError."""
-    from minimax_cal.robots.yaml_text import parsed  # few robots come as one
+    from minimax_cal.robots.strict_yaml import parse_strict_yaml  # few robots come as one
 
-    return parsed(text)
+    return parse_strict_yaml(text)
 
 
-PARSERS: dict[str, tuple[Callable[[str], Any], type[Exception]]] = {
-    ".json": (partial(json.loads, object_pairs_hook=once), json.JSONDecodeError),
+PARSER_BY_SUFFIX: dict[str, tuple[Callable[[str], Any], type[Exception]]] = {
+    ".json": (
+        partial(json.loads, object_pairs_hook=build_object_with_unique_keys),
+        json.JSONDecodeError,
+    ),
     ".toml": (tomllib.loads, tomllib.TOMLDecodeError),
-    ".yaml": (written_out, ValueError),
-    ".yml": (written_out, ValueError),
+    ".yaml": (parse_yaml_text, ValueError),
+    ".yml": (parse_yaml_text, ValueError),
 }
 
 
@@ -578,26 +627,31 @@ def load_robot(source: Robot | Path | str) -> Robot:
     >>> robot = mc.load_robot("irb2600")
     """
     if isinstance(source, Robot) or str(source) in builtin_robots():
-        return source if isinstance(source, Robot) else builtin_robot(str(source))
+        return source if isinstance(source, Robot) else load_builtin_robot(str(source))
     path = Path(source)
-    from minimax_cal.robots.urdf import has_links, load_urdf  # not for a built-in robot
+    from minimax_cal.robots.urdf_robot import (
+        is_urdf_or_mjcf_source,
+        load_urdf,
+    )  # not for a built-in robot
 
-    if has_links(source):
+    if is_urdf_or_mjcf_source(source):
         found = load_urdf(source)
-        return replace(robot_from_dict(found.content, str(source)), notices=found.remaining)
-    if path.suffix.lower() in (".csv", *SUFFIXES):
-        from minimax_cal.robots.data_sheet import content_of  # few robots come as one
+        return replace(
+            robot_from_dict(found.content, str(source)), notices=found.base_and_tool_notices
+        )
+    if path.suffix.lower() in (".csv", *WORKBOOK_SUFFIXES):
+        from minimax_cal.robots.dh_data_sheet import read_dh_data_sheet  # few robots come as one
 
-        return robot_from_dict(content_of(path), str(path))
-    if path.suffix.lower() not in PARSERS:
+        return robot_from_dict(read_dh_data_sheet(path), str(path))
+    if path.suffix.lower() not in PARSER_BY_SUFFIX:
         if len(str(source)) < 200 and path.exists():
-            use = ", ".join((*PARSERS, ".csv, .xlsx, .urdf, .xml"))
+            use = ", ".join((*PARSER_BY_SUFFIX, ".csv, .xlsx, .urdf, .xml"))
             raise RobotError(f"{path}: not a robot file; use {use}")
         near = difflib.get_close_matches(str(source), builtin_robots(), 1)
         hint = f"did you mean {near[0]!r}?" if near else f"built in: {', '.join(builtin_robots())}"
         raise RobotError(f"no robot called {str(source)[:60]!r}; {hint}, or give a robot file")
-    parse, failure = PARSERS[path.suffix.lower()]
-    text = read_text(path, kind=RobotError)
+    parse, failure = PARSER_BY_SUFFIX[path.suffix.lower()]
+    text = read_text(path, error_type=RobotError)
     try:
         content = parse(text)
     except (failure, RecursionError, ValueError) as error:

@@ -9,28 +9,31 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from minimax_cal.correcting.exporters.correct import laid, match
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import CalibrationError, OptionError, RobotError
-from minimax_cal.ground.files import json_of
-from minimax_cal.robots.gravity import G, weighed
-from minimax_cal.robots.mjcf import (
-    Given,
+from minimax_cal.compensation.exporters.urdf_correction import (
+    link_frames_at_zero,
+    match_robot_to_urdf,
+)
+from minimax_cal.core.arrays import Array
+from minimax_cal.core.errors import CalibrationError, OptionError, RobotError
+from minimax_cal.core.files import parse_json
+from minimax_cal.robots.gravity_torques import STANDARD_GRAVITY, known_link_mass_mask
+from minimax_cal.robots.joint_sampling import random_joint_values
+from minimax_cal.robots.mjcf_import import (
+    MjcfModel,
     body_name,
     body_pose,
-    drives,
-    is_driven,
-    mujoco,
-    tree_of,
-    way_to,
+    convert_model_to_urdf,
+    find_joint_path_to_body,
+    has_actuator,
+    import_mujoco,
+    is_driven_by_actuator,
 )
 from minimax_cal.robots.robot import Robot, robot_from_dict
-from minimax_cal.robots.sampling import random_joints
-from minimax_cal.robots.transforms import inverse, transform
-from minimax_cal.robots.urdf import UrdfRobot, both_ends, to_robot
+from minimax_cal.robots.transforms import build_transform, invert_transform
+from minimax_cal.robots.urdf_robot import UrdfRobot, convert_urdf_to_robot, split_root_and_tip
 
-ROBOT = "minimax_cal_robot"  # the text under which a file of ours holds its robot whole
-SAME_ROBOT = 1e-6  # a file's own robot may differ from its bodies by no more [m, rad]
+ROBOT_TEXT_NAME = "minimax_cal_robot"  # the text under which a file of ours holds its robot whole
+MAX_ROBOT_TEXT_MISFIT = 1e-6  # a file's own robot may differ from its bodies by no more [m, rad]
 ORIENTATION_ATTRIBUTES = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
 IMPLICIT_INTEGRATORS = (2, 3)  # mjINT_IMPLICIT, mjINT_IMPLICITFAST
 MIN_TIMESTEP = 1e-5  # with which an arm comes to rest in seconds of computation [s]
@@ -63,81 +66,85 @@ class ModelServos:
 
 
 @dataclass(frozen=True, eq=False)
-class Chain:
+class ModelArm:
     """An arm in a compiled model.
 
     model: of MuJoCo; its contacts are off from then on: the arm is judged, not what is around it.
-    joints: their n ids, from the foot.  seen: the same arm as a URDF's would be,
+    joint_ids: their n ids, from the foot.  urdf_robot: the same arm as a URDF's would be,
     world to last body.  robot: that it is, nominal; masses NaN where they are assumed.
     base: (4, 4) frame 0 of the robot in the world [m].  gravity: [m/s^2].
     """
 
     model: Any
-    joints: tuple[int, ...]
-    seen: UrdfRobot
+    joint_ids: tuple[int, ...]
+    urdf_robot: UrdfRobot
     robot: Robot
     base: Array
     gravity: float
 
     def __post_init__(self) -> None:
-        self.model.opt.disableflags |= int(mujoco().mjtDisableBit.mjDSBL_CONTACT)
+        self.model.opt.disableflags |= int(import_mujoco().mjtDisableBit.mjDSBL_CONTACT)
 
     @staticmethod
-    def find(given: Given, joint_count: int, tip: str = "") -> Chain:
+    def find(given: MjcfModel, joint_count: int, tip: str = "") -> ModelArm:
         """The arm of so many joints in a model's file.  tip: its last body.  Raises RobotError."""
-        model = given.compiled()
-        return chain_of(model, joint_count, given.source, tip, unknown=given.assumed)
+        model = given.compile_model()
+        return find_model_arm(
+            model, joint_count, given.source, tip, has_assumed_masses=given.assumed
+        )
 
     @property
-    def bodies(self) -> tuple[int, ...]:
+    def body_ids(self) -> tuple[int, ...]:
         """Ids of the bodies that the joints carry."""
-        return tuple(int(self.model.jnt_bodyid[j]) for j in self.joints)
+        return tuple(int(self.model.jnt_bodyid[j]) for j in self.joint_ids)
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def joint_names(self) -> tuple[str, ...]:
         """Of the joints."""
-        return tuple(self.model.joint(j).name for j in self.joints)
+        return tuple(self.model.joint(j).name for j in self.joint_ids)
 
     @property
-    def places(self) -> Array:
+    def qpos_indices(self) -> Array:
         """(n,) where the joints are in qpos."""
-        return np.array(self.model.jnt_qposadr[list(self.joints)])
+        return np.array(self.model.jnt_qposadr[list(self.joint_ids)])
 
     @property
-    def dofs(self) -> Array:
+    def dof_indices(self) -> Array:
         """(n,) where they are in qvel and forces."""
-        return np.array(self.model.jnt_dofadr[list(self.joints)])
+        return np.array(self.model.jnt_dofadr[list(self.joint_ids)])
 
     @property
-    def step(self) -> float:
+    def timestep(self) -> float:
         """Of time [s]."""
         return float(self.model.opt.timestep)
 
-    def fresh(self) -> tuple[Any, Any, Any, Array, Array]:
+    def new_data(self) -> tuple[Any, Any, Any, Array, Array]:
         """MuJoCo, the model, new data of it, and (n,) where joints are in qpos and in forces."""
-        mj = mujoco()
-        return mj, self.model, mj.MjData(self.model), self.places, self.dofs
+        mj = import_mujoco()
+        return mj, self.model, mj.MjData(self.model), self.qpos_indices, self.dof_indices
 
-    def in_model(self, model: Any) -> Chain:
+    def with_model(self, model: Any) -> ModelArm:
         """The same joints in another compiled model, whose bodies stand where they did."""
-        return replace(self, model=model, joints=self.ids_in(model))
+        return replace(self, model=model, joint_ids=self.find_joint_ids(model))
 
-    def ids_in(self, model: Any) -> tuple[int, ...]:
+    def find_joint_ids(self, model: Any) -> tuple[int, ...]:
         """Of the joints of the same names in another model."""
-        return tuple(int(model.joint(name).id) for name in self.names)
+        return tuple(int(model.joint(name).id) for name in self.joint_names)
 
     @property
-    def servos(self) -> Array:
+    def servo_ids(self) -> Array:
         """(n,) ids of the position actuators of its joints, -1 where there is none."""
         m = self.model
         ids = [i for i in range(m.nu) if m.actuator_biasprm[i, 1] < 0.0 < m.actuator_gainprm[i, 0]]
-        return np.array([next((i for i in ids if drives(m, i, j)), -1) for j in self.joints])
+        return np.array(
+            [next((i for i in ids if is_driven_by_actuator(m, i, j)), -1) for j in self.joint_ids]
+        )
 
     def read_servos(self) -> ModelServos:
         """The servos with their gains, dampers and force limits, as MuJoCo has compiled them."""
-        model, joints, n = self.model, list(self.joints), len(self.joints)
+        model, joints, n = self.model, list(self.joint_ids), len(self.joint_ids)
         gain, damper, limits = np.zeros(n), np.zeros(n), np.array([[-np.inf, np.inf]] * n)
-        for i, (joint, servo) in enumerate(zip(joints, self.servos, strict=True)):
+        for i, (joint, servo) in enumerate(zip(joints, self.servo_ids, strict=True)):
             if model.jnt_actfrclimited[joint]:
                 limits[i] = model.jnt_actfrcrange[joint]
             if servo < 0:
@@ -148,9 +155,9 @@ class Chain:
                 ends = np.sort(model.actuator_forcerange[servo] * gear)
                 limits[i] = max(limits[i, 0], ends[0]), min(limits[i, 1], ends[1])
         is_explicit = model.opt.integrator not in IMPLICIT_INTEGRATORS
-        is_floating = (model.body_gravcomp[list(self.bodies)] > 0.0).any()
+        is_floating = (model.body_gravcomp[list(self.body_ids)] > 0.0).any()
         gravity_free = bool(is_floating and not model.jnt_actgravcomp[joints].any())
-        return ModelServos(gain, damper, model.dof_damping[self.dofs], limits,
+        return ModelServos(gain, damper, model.dof_damping[self.dof_indices], limits,
                            self.has_servo_dampers() | is_explicit, gravity_free)  # fmt: skip
 
     def has_servo_dampers(self) -> Array:
@@ -159,14 +166,17 @@ class Chain:
         Whatever the integrator of the scene that the file is attached to, it takes that implicitly.
         """
         model = self.model
-        ours, bias = find_id(model, "TEXT", ROBOT) >= 0, model.actuator_biasprm
+        ours, bias = find_id(model, "TEXT", ROBOT_TEXT_NAME) >= 0, model.actuator_biasprm
         bare = [i for i in range(model.nu) if ours and bias[i, 1] < 0.0 and bias[i, 2] == 0.0]
-        return np.array([any(drives(model, i, j) for i in bare) for j in self.joints], dtype=bool)
+        return np.array(
+            [any(is_driven_by_actuator(model, i, j) for i in bare) for j in self.joint_ids],
+            dtype=bool,
+        )
 
     @property
     def has_assumed_masses(self) -> bool:
         """Whether the model does not tell the masses of all links."""
-        return not bool(weighed(self.robot).all())
+        return not bool(known_link_mass_mask(self.robot).all())
 
     def find_masses(self, nominal: Robot) -> tuple[Array, Array] | None:
         """Masses (n,) [kg], their centres (n, 3) in the links of another robot of the arm [m].
@@ -175,10 +185,13 @@ class Chain:
         """
         if self.has_assumed_masses:
             return None
-        base, _ = match(nominal, self.seen)
-        links, own = laid(nominal, base)[1:], laid(self.robot, self.base)[1:]
+        base, _ = match_robot_to_urdf(nominal, self.urdf_robot)
+        links, own = (
+            link_frames_at_zero(nominal, base)[1:],
+            link_frames_at_zero(self.robot, self.base)[1:],
+        )
         com = [
-            inverse(a)[:3, :3] @ (b[:3, :3] @ c + b[:3, 3] - a[:3, 3])
+            invert_transform(a)[:3, :3] @ (b[:3, :3] @ c + b[:3, 3] - a[:3, 3])
             for a, b, c in zip(links, own, self.robot.com, strict=True)
         ]
         return self.robot.mass, np.array(com)
@@ -191,7 +204,7 @@ class Chain:
         servos = self.read_servos()
         if servos.gravity_free:
             return
-        mj, model, data, at, dofs = self.fresh()
+        mj, model, data, at, dofs = self.new_data()
         for row in q:
             data.qpos[at] = row
             mj.mj_forward(model, data)
@@ -202,15 +215,15 @@ class Chain:
                 unit = "N" if self.robot.prismatic[i] else "N m"
                 limit = np.abs(servos.limits[i]).min()
                 raise RobotError(
-                    f"{source}: joint {self.names[i]}: gravity asks for {abs(needed[i]):.4g} "
+                    f"{source}: joint {self.joint_names[i]}: gravity asks for {abs(needed[i]):.4g} "
                     f"{unit} at a measured pose, its force limit is {limit:.4g} {unit}; raise the "
                     "limit (forcerange), or mend the masses"
                 )
 
     def find_filtered_servos(self) -> str:
         """The joints whose servos filter their commands, in words; empty where none does."""
-        is_filtered = self.model.actuator_dyntype[self.servos] * (self.servos >= 0) > 0
-        return ", ".join(np.array(self.names)[is_filtered])
+        is_filtered = self.model.actuator_dyntype[self.servo_ids] * (self.servo_ids >= 0) > 0
+        return ", ".join(np.array(self.joint_names)[is_filtered])
 
     def robot_under_gravity(self) -> Robot:
         """The robot, its vertical as long as the model's gravity over that of the earth.
@@ -221,21 +234,21 @@ class Chain:
             raise OptionError(
                 "the model has no gravity; give it <option gravity=...>, as the arm has"
             )
-        return replace(self.robot, up=self.robot.up * self.gravity / G)
+        return replace(self.robot, up=self.robot.up * self.gravity / STANDARD_GRAVITY)
 
     def find_feed_forward(self) -> dict[int, int]:
         """Ids of actuators that take the commanded speed of a joint, and which joint (from 0)."""
-        ids = (find_id(self.model, "ACTUATOR", f"{name}_ahead") for name in self.names)
+        ids = (find_id(self.model, "ACTUATOR", f"{name}_ahead") for name in self.joint_names)
         return {number: j for j, number in enumerate(ids) if number >= 0}
 
     def find_plays(self) -> dict[int, int]:
         """Joints (from 0) whose gear has play, and where the position in it is in qpos."""
-        ids = (find_id(self.model, "JOINT", f"play{i + 1}") for i in range(len(self.joints)))
+        ids = (find_id(self.model, "JOINT", f"play{i + 1}") for i in range(len(self.joint_ids)))
         return {i: int(self.model.jnt_qposadr[k]) for i, k in enumerate(ids) if k >= 0}
 
     def find_carrying_joints(self) -> Array:
         """(nbody,) which joint (from 0), of several the last, carries a body; -1 for none."""
-        model, bodies = self.model, self.bodies
+        model, bodies = self.model, self.body_ids
         joint = np.full(model.nbody, -1)
         for body in range(1, model.nbody):
             own = bodies.index(body) if body in bodies else -1
@@ -243,29 +256,29 @@ class Chain:
         return joint
 
     @property
-    def carrier(self) -> int:
+    def target_body(self) -> int:
         """Id of the body that carries the targets: a tool of ours that sags, else the last one."""
-        tool, last = find_id(self.model, "BODY", "tool"), len(self.joints) - 1
+        tool, last = find_id(self.model, "BODY", "tool"), len(self.joint_ids) - 1
         is_ours = tool >= 0 and self.find_carrying_joints()[tool] == last
-        return tool if is_ours else self.bodies[-1]
+        return tool if is_ours else self.body_ids[-1]
 
-    def data_at_zero(self) -> Any:
+    def compute_data_at_zero(self) -> Any:
         """The model's data with the arm at joint values 0, all else as the file has it."""
-        mj, model, data, at, _ = self.fresh()
+        mj, model, data, at, _ = self.new_data()
         data.qpos[at] = 0.0
         mj.mj_kinematics(model, data)
         return data
 
     def find_poses_at_zero(self) -> Array:
         """(nbody, 4, 4) poses of all bodies in the world, the arm at joint values 0 [m]."""
-        data = self.data_at_zero()
+        data = self.compute_data_at_zero()
         return np.array([body_pose(data, body) for body in range(self.model.nbody)])
 
     def find_largest_inertias(self) -> Array:
         """(n,) about each joint, its motor's with it, all over the workspace [kg m^2]."""
-        mj, model, data, at, dofs = self.fresh()
+        mj, model, data, at, dofs = self.new_data()
         column, out = np.zeros(model.nv), np.zeros(len(dofs))
-        for row in random_joints(self.robot, (INERTIA_SAMPLES,), np.random.default_rng(0)):
+        for row in random_joint_values(self.robot, (INERTIA_SAMPLES,), np.random.default_rng(0)):
             data.qpos[at] = row
             mj.mj_forward(model, data)
             for i, unit in enumerate(np.eye(model.nv)[dofs]):
@@ -274,10 +287,18 @@ class Chain:
         return out
 
 
-def chain_of(model: Any, count: int, source: str, tip: str = "", *, unknown: bool = False) -> Chain:
+def find_model_arm(
+    model: Any,
+    joint_count: int,
+    source: str,
+    tip_name: str = "",
+    *,
+    has_assumed_masses: bool = False,
+) -> ModelArm:
     """The arm of so many joints in a model.
 
-    tip: its last body.  unknown: whether its masses are assumed.  Raises RobotError.
+    tip_name: its last body.  has_assumed_masses: whether its masses are assumed.  Raises
+    RobotError.
     """
     step = model.opt.timestep
     if step < MIN_TIMESTEP:
@@ -285,84 +306,98 @@ def chain_of(model: Any, count: int, source: str, tip: str = "", *, unknown: boo
             f"{source}: its timestep of {step:g} s is too short for an arm to come to rest; give "
             f'<option timestep="..."> of {MIN_TIMESTEP:g} s or more'
         )
-    return chain_along(model, joints_of(model, count, source, tip), source, unknown=unknown)
+    return build_model_arm(
+        model,
+        find_arm_joints(model, joint_count, source, tip_name),
+        source,
+        has_assumed_masses=has_assumed_masses,
+    )
 
 
-def chain_along(
-    model: Any, joints: tuple[int, ...], source: str, *, unknown: bool = False
-) -> Chain:
+def build_model_arm(
+    model: Any, joint_ids: tuple[int, ...], source: str, *, has_assumed_masses: bool = False
+) -> ModelArm:
     """The arm of some joints (n,) of a model, by their ids from the foot.
 
     A file of ours holds its robot whole, as text: that counts, where the bodies still have it.
-    unknown: whether its masses are assumed.  Raises RobotError.
+    has_assumed_masses: whether its masses are assumed.  Raises RobotError.
     """
-    tip = body_name(model, int(model.jnt_bodyid[joints[-1]]))
-    seen = to_robot(tree_of(model, source, joints), tip)
+    tip = body_name(model, int(model.jnt_bodyid[joint_ids[-1]]))
+    seen = convert_urdf_to_robot(convert_model_to_urdf(model, source, joint_ids), tip)
     gravity = float(np.linalg.norm(model.opt.gravity))
     robot, base = robot_from_dict(seen.content, source), seen.base
     if gravity > 0.0:
         robot = replace(robot, up=-(base[:3, :3].T @ model.opt.gravity) / gravity)
-    if unknown:
+    if has_assumed_masses:
         robot = replace(robot, mass=robot.mass * np.nan, com=robot.com * np.nan)
-    text = find_id(model, "TEXT", ROBOT)
+    text = find_id(model, "TEXT", ROBOT_TEXT_NAME)
     if text >= 0:
         start, size = int(model.text_adr[text]), int(model.text_size[text])
         with suppress(ValueError, CalibrationError):  # no robot, or bodies were moved since
             raw = bytes(model.text_data[start : start + size]).rstrip(b"\0")
-            ours = robot_from_dict(json_of(raw), source)
-            if ours.joints == len(joints):
-                place, misfit = match(ours, seen)
-                if misfit < SAME_ROBOT:
+            ours = robot_from_dict(parse_json(raw), source)
+            if ours.joints == len(joint_ids):
+                place, misfit = match_robot_to_urdf(ours, seen)
+                if misfit < MAX_ROBOT_TEXT_MISFIT:
                     robot, base = ours, place
-    return Chain(model, joints, seen, robot, base, gravity)
+    return ModelArm(model, joint_ids, seen, robot, base, gravity)
 
 
 def find_id(model: Any, kind: str, name: str) -> int:
     """Id of the element of a name, -1 where there is none.  kind: as in mjOBJ_JOINT."""
-    return int(mujoco().mj_name2id(model, getattr(mujoco().mjtObj, f"mjOBJ_{kind}"), name))
+    return int(
+        import_mujoco().mj_name2id(model, getattr(import_mujoco().mjtObj, f"mjOBJ_{kind}"), name)
+    )
 
 
-def joints_of(model: Any, count: int, source: str, tip: str) -> tuple[int, ...]:
+def find_arm_joints(model: Any, joint_count: int, source: str, tip_name: str) -> tuple[int, ...]:
     """Ids of the joints from the foot to the tip, or of the only arm of so many joints.
 
     Where more lie on the way, those that an actuator drives; of several the driven arm.
     """
     found: dict[tuple[int, ...], list[str]] = {}
     sites = {model.site(i).name: int(model.site_bodyid[i]) for i in range(model.nsite)}
-    tip = both_ends(tip, [*sites, *(model.body(i).name for i in range(model.nbody))])[1]
-    tip = model.body(sites[tip]).name if tip in sites else tip
+    tip_name = split_root_and_tip(
+        tip_name, [*sites, *(model.body(i).name for i in range(model.nbody))]
+    )[1]
+    tip_name = model.body(sites[tip_name]).name if tip_name in sites else tip_name
     for body in range(1, model.nbody):
         name = model.body(body).name
-        if tip and name != tip:
+        if tip_name and name != tip_name:
             continue
-        way = way_to(model, body)
-        if len(way) > count:
-            way = tuple(j for j in way if is_driven(model, j))
-        if len(way) == count:
+        way = find_joint_path_to_body(model, body)
+        if len(way) > joint_count:
+            way = tuple(j for j in way if has_actuator(model, j))
+        if len(way) == joint_count:
             found.setdefault(way, []).append(name)
-    if tip and not any(model.body(i).name == tip for i in range(model.nbody)):
-        raise RobotError(f"{source}: has no body {tip!r}")
-    actuated = [way for way in found if all(is_driven(model, joint) for joint in way)]
+    if tip_name and not any(model.body(i).name == tip_name for i in range(model.nbody)):
+        raise RobotError(f"{source}: has no body {tip_name!r}")
+    actuated = [way for way in found if all(has_actuator(model, joint) for joint in way)]
     if len(found) == 1 or len(actuated) == 1:
         return actuated[0] if actuated else next(iter(found))
     if not found:
-        most = max((len(way_to(model, b)) for b in range(1, model.nbody)), default=0)
+        most = max(
+            (len(find_joint_path_to_body(model, b)) for b in range(1, model.nbody)), default=0
+        )
         raise RobotError(
-            f"{source}: no chain of {count} hinges and slides, as the measurements have joints "
+            f"{source}: no chain of {joint_count} hinges and "
+            f"slides, as the measurements have joints "
             f"(the longest has {most})"
         )
     ends = ", ".join(names[0] or "a body without a name" for names in found.values())
-    raise RobotError(f"{source}: several arms of {count} joints ({ends}); name a body as tip=")
+    raise RobotError(
+        f"{source}: several arms of {joint_count} joints ({ends}); name a body as tip="
+    )
 
 
-def fill_history(model: Any, data: Any) -> None:
+def fill_command_history(model: Any, data: Any) -> None:
     """Let delayed actuators have had their commands all the time: MuJoCo begins with 0."""
     for k, (count, _) in enumerate(getattr(model, "actuator_history", ())):
         if count:
-            mujoco().mj_initCtrlHistory(model, data, k, None, np.full(count, data.ctrl[k]))
+            import_mujoco().mj_initCtrlHistory(model, data, k, None, np.full(count, data.ctrl[k]))
 
 
 def pose_in_parent(model: Any, body: int) -> Array:
     """(4, 4) of a body in its parent body, as a model has it [m]."""
     turn = Rotation.from_quat(model.body_quat[body], scalar_first=True).as_matrix()
-    return transform(turn, np.array(model.body_pos[body]))
+    return build_transform(turn, np.array(model.body_pos[body]))

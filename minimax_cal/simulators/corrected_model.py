@@ -15,17 +15,36 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from minimax_cal.correcting.exporters.correct import NOTED, laid, match, seated
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import RobotError
-from minimax_cal.robots.document import Document
-from minimax_cal.robots.gravity import LEAST_MASS, G, masses_of
-from minimax_cal.robots.mjcf import Given, shifted
+from minimax_cal.compensation.exporters.urdf_correction import (
+    MIN_NOTED_URDF_MISFIT,
+    align_frame_with_joint_axis,
+    link_frames_at_zero,
+    match_robot_to_urdf,
+)
+from minimax_cal.core.arrays import Array
+from minimax_cal.core.errors import RobotError
+from minimax_cal.robots.gravity_torques import (
+    MIN_SIMULATED_LINK_MASS,
+    STANDARD_GRAVITY,
+    link_masses_and_centres,
+)
+from minimax_cal.robots.mjcf_import import MjcfModel, translation_to_point
 from minimax_cal.robots.robot import Robot
-from minimax_cal.robots.transforms import SAME, difference, head, inverse
-from minimax_cal.simulators.arm import Arm
-from minimax_cal.simulators.chain import ORIENTATION_ATTRIBUTES, ROBOT, Chain, pose_in_parent
-from minimax_cal.simulators.elements import Layout, set_link_mass, write_arm_elements
+from minimax_cal.robots.transforms import (
+    MAX_EQUAL_TRANSFORM_DIFFERENCE,
+    invert_transform,
+    max_entry_difference,
+    theta_d_transform,
+)
+from minimax_cal.robots.xml_document import XmlDocument
+from minimax_cal.simulators.arm import SimulatedArm
+from minimax_cal.simulators.chain import (
+    ORIENTATION_ATTRIBUTES,
+    ROBOT_TEXT_NAME,
+    ModelArm,
+    pose_in_parent,
+)
+from minimax_cal.simulators.elements import ArmLayout, set_link_mass, write_arm_elements
 from minimax_cal.simulators.mjcf_tree import MjcfTree, pose_attributes
 
 PlacedRobot = tuple[Robot, Array]  # a robot, and its frame 0 (4, 4) in the model's world [m]
@@ -38,16 +57,16 @@ class CorrectedModel:
     base: (4, 4) frame 0 of the nominal robot in the model's world [m].
     """
 
-    document: Document
+    document: XmlDocument
     base: Array
     notices: tuple[str, ...]
 
 
 def correct_model(
-    given: Given,
-    chain: Chain,
+    given: MjcfModel,
+    chain: ModelArm,
     nominal: Robot,
-    arm: Arm | None,
+    arm: SimulatedArm | None,
     target_names: Sequence[str] = (),
     *,
     with_servos: bool = True,
@@ -61,9 +80,9 @@ def correct_model(
     Raises RobotError for a model without gravity, and for joints without a name.
     """
     # Registration: where the nominal robot stands in the model's world; both have to move alike.
-    base, misfit = match(nominal, chain.seen)
+    base, misfit = match_robot_to_urdf(nominal, chain.urdf_robot)
     notices = list[str]()
-    if misfit > NOTED:
+    if misfit > MIN_NOTED_URDF_MISFIT:
         notices.append(
             f"{given.source} and the nominal robot differ by up to {1e3 * misfit:.3g} mm or mrad: "
             "the written model follows the calibrated robot"
@@ -80,71 +99,85 @@ def correct_model(
         for i, body in enumerate(layout.bodies):
             set_link_mass(body, arm, i)
         for text in tree.root.iter("text"):
-            if text.get("name") == ROBOT:
+            if text.get("name") == ROBOT_TEXT_NAME:
                 text.set("data", json.dumps(arm.robot.to_dict()))
 
     # Compliances: those that give the sag of the fit under the model's own gravity.
-    if arm and not chain.gravity and (arm.turn.any() or arm.base or arm.bend):
+    if (
+        arm
+        and not chain.gravity
+        and (arm.joint_compliance.any() or arm.base_compliance or arm.link_flexibility)
+    ):
         raise RobotError(f"{given.source}: has no gravity, so nothing in it can sag; give it some")
     if arm:
-        factor = G / chain.gravity if chain.gravity else 1.0
-        bend = {link: value * factor for link, value in arm.bend.items()}
-        arm = replace(arm, turn=arm.turn * factor, base=arm.base * factor, bend=bend,
-                      sag=arm.sag * factor, drawn=arm.drawn * factor)  # fmt: skip
+        factor = STANDARD_GRAVITY / chain.gravity if chain.gravity else 1.0
+        bend = {link: value * factor for link, value in arm.link_flexibility.items()}
+        arm = replace(
+            arm,
+            joint_compliance=arm.joint_compliance * factor,
+            base_compliance=arm.base_compliance * factor,
+            link_flexibility=bend,
+            tool_sag=arm.tool_sag * factor,
+            tool_extension=arm.tool_extension * factor,
+        )
 
     # Elements: servos, springs, play, a tool that sags, and the targets on it.
-    held = arm or Arm.rigid(nominal, masses_of(chain.robot, LEAST_MASS))
+    held = arm or SimulatedArm.rigid(
+        nominal, link_masses_and_centres(chain.robot, MIN_SIMULATED_LINK_MASS)
+    )
     write_arm_elements(layout, held, target_names or None, with_servos=with_servos)
     lengthen_keyframes(given, tree.root, chain.model)
     return CorrectedModel(document, base, tuple(notices))
 
 
 def move_bodies(
-    tree: MjcfTree, chain: Chain, nominal: PlacedRobot, calibrated: PlacedRobot
-) -> Layout:
+    tree: MjcfTree, chain: ModelArm, nominal: PlacedRobot, calibrated: PlacedRobot
+) -> ArmLayout:
     """Move the bodies of a tree to where the calibrated robot has them; its layout from then on.
 
     tree: a copy of the given one.  Bodies between two joints of the arm move with the first.
     """
-    model, poses, ids = chain.model, chain.find_poses_at_zero(), list(chain.joints)
+    model, poses, ids = chain.model, chain.find_poses_at_zero(), list(chain.joint_ids)
     joints, parents = tree.find_joints(chain), tree.find_parents()
     bodies = [parents[joint] for joint in joints]
-    before, after = laid(*nominal), laid(*calibrated)
-    old, new, seats = poses[list(chain.bodies)], list[Array](), []
-    moving = [joint for joint in chain.seen.chain if joint.moves]
+    before, after = link_frames_at_zero(*nominal), link_frames_at_zero(*calibrated)
+    old, new, seats = poses[list(chain.body_ids)], list[Array](), []
+    moving = [joint for joint in chain.urdf_robot.chain if joint.is_moving]
     for i, (body, joint) in enumerate(zip(bodies, moving, strict=True)):
         if model.jnt_stiffness[ids[i]]:  # its own, or of its class
             joints[i].set("stiffness", "0")
 
         # The joint's frame in the link before it, its axis along z: the same in both robots.
-        anchor = shifted(model.jnt_pos[ids[i]])
-        seat = seated(inverse(before[i]) @ old[i] @ anchor, joint, nominal[0].sign[i])
+        anchor = translation_to_point(model.jnt_pos[ids[i]])
+        seat = align_frame_with_joint_axis(
+            invert_transform(before[i]) @ old[i] @ anchor, joint, nominal[0].sign[i]
+        )
         at = after[i] @ seat
-        new.append(at @ inverse(anchor))
-        seats.append(inverse(new[i]) @ after[i] @ head(calibrated[0].mdh[i]))
+        new.append(at @ invert_transform(anchor))
+        seats.append(invert_transform(new[i]) @ after[i] @ theta_d_transform(calibrated[0].mdh[i]))
 
         # The body in its parent, at the joint value (ref) at which the file has it.
-        parent = poses[model.body_parentid[chain.bodies[i]]]
+        parent = poses[model.body_parentid[chain.body_ids[i]]]
         if i:
-            parent = new[i - 1] @ inverse(old[i - 1]) @ parent
-        motion = joint.motion(model.qpos0[[model.jnt_qposadr[ids[i]]]])[0]
-        pose = inverse(parent) @ at @ motion @ inverse(anchor)
-        compiled = pose_in_parent(model, chain.bodies[i])
-        if difference(compiled, pose) <= SAME * 10.0:
+            parent = new[i - 1] @ invert_transform(old[i - 1]) @ parent
+        motion = joint.motion_transforms(model.qpos0[[model.jnt_qposadr[ids[i]]]])[0]
+        pose = invert_transform(parent) @ at @ motion @ invert_transform(anchor)
+        compiled = pose_in_parent(model, chain.body_ids[i])
+        if max_entry_difference(compiled, pose) <= MAX_EQUAL_TRANSFORM_DIFFERENCE * 10.0:
             continue
 
         # A <frame> around it stays: MuJoCo takes the attributes of the body relative to that.
         if parents[body].tag not in ("body", "worldbody"):
-            pose = tree.read_pose(body) @ inverse(compiled) @ pose
+            pose = tree.read_pose(body) @ invert_transform(compiled) @ pose
         for name in ORIENTATION_ATTRIBUTES:
             body.attrib.pop(name, None)
         body.attrib |= pose_attributes(pose)
-    return Layout(tree, chain.names, tuple(bodies), tuple(joints), np.array(seats),
+    return ArmLayout(tree, chain.joint_names, tuple(bodies), tuple(joints), np.array(seats),
                   model.jnt_pos[ids], model.jnt_axis[ids], chain.read_servos(),
-                  chain.find_largest_inertias(), chain.step)  # fmt: skip
+                  chain.find_largest_inertias(), chain.timestep)  # fmt: skip
 
 
-def lengthen_keyframes(given: Given, tree: ET.Element, model: Any) -> None:
+def lengthen_keyframes(given: MjcfModel, tree: ET.Element, model: Any) -> None:
     """Give the springs that a tree has now their places in its keyframes, at 0.
 
     model: as it was.
@@ -155,7 +188,7 @@ def lengthen_keyframes(given: Given, tree: ET.Element, model: Any) -> None:
     bare = deepcopy(tree)
     for section in bare.findall("keyframe"):
         bare.remove(section)
-    after, old = given.compiled(bare), {model.joint(j).name for j in range(model.njnt)}
+    after, old = given.compile_model(bare), {model.joint(j).name for j in range(model.njnt)}
     new = [j for j in range(after.njnt) if after.joint(j).name and after.joint(j).name not in old]
     for name, size, starts in (("qpos", model.nq, after.jnt_qposadr),
                                ("qvel", model.nv, after.jnt_dofadr)):  # fmt: skip

@@ -22,16 +22,16 @@ from typing import Any
 
 import numpy as np
 
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import CalibrationError, RobotError
-from minimax_cal.ground.files import saved_content
+from minimax_cal.core.arrays import Array
+from minimax_cal.core.errors import CalibrationError, RobotError
+from minimax_cal.core.files import read_saved_json
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.modelling.cell import Cell, cell_from_dict, still
-from minimax_cal.robots.kinematics import hat, rotation
-from minimax_cal.robots.mjcf import body_pose, mujoco, way_to
-from minimax_cal.robots.transforms import inverse
-from minimax_cal.simulators.arm import Arm
-from minimax_cal.simulators.chain import Chain, fill_history
+from minimax_cal.modelling.cell import Cell, build_measurements_at_rest, cell_from_dict
+from minimax_cal.robots.kinematics import rotation_from_vector, skew_matrix
+from minimax_cal.robots.mjcf_import import body_pose, find_joint_path_to_body, import_mujoco
+from minimax_cal.robots.transforms import invert_transform
+from minimax_cal.simulators.arm import SimulatedArm
+from minimax_cal.simulators.chain import ModelArm, fill_command_history
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,13 +46,13 @@ class Commands:
     def __call__(self, q: Array) -> Array:
         """The commands for joint values q, (n,) or (m, n) [rad, m]."""
         rows = np.atleast_2d(np.asarray(q, dtype=float))
-        told = still(rows, self.cell.target_names, self.cell.robot)
+        told = build_measurements_at_rest(rows, self.cell.target_names, self.cell.robot)
         return self.follow(told).reshape(np.shape(q))
 
     def follow(self, data: Measurements) -> Array:
         """(m, n) the same for measured poses, with the way that led to each [rad, m]."""
-        turn = self.cell.effects.turn(self.cell.scene(data))
-        return data.q + self.cell.robot.commanded(turn)
+        turn = self.cell.effects.joint_shifts(self.cell.pose_arm(data))
+        return data.q + self.cell.robot.controller_joint_values(turn)
 
 
 def load_commands(path: Path | str) -> Commands:
@@ -77,7 +77,7 @@ def load_commands(path: Path | str) -> Commands:
     --------
     >>> data.ctrl[:] = mc.load_commands("arm.commands.json")(q)
     """
-    content = saved_content(path)
+    content = read_saved_json(path)
     if content.get("kind") != "commands" or "cell" not in content:
         raise CalibrationError(
             f"{path}: is no command map; an export to mjcf writes one where it is needed"
@@ -88,53 +88,56 @@ def load_commands(path: Path | str) -> Commands:
 # ---- driven --------------------------------------------------------------------------------------
 
 
-MOVE, REST = 2.0, 1.5  # a move lasts at least, and a rest after it [s]
-FASTEST, FASTEST_SLIDE = 1.0, 0.25  # no joint is commanded faster [rad/s, m/s]
-STILL, STILL_SLIDE = 2e-3, 1e-3  # slower is at rest [rad/s, m/s]
-PEAK = 1.875  # largest speed of a minimum-jerk move of length 1 in time 1
-RUNS = 4  # of neighbouring poses, whatever the machine: its results are those of any other
-LOOKS = 10  # timesteps of a rest between two looks at its forces
+MIN_MOVE_TIME, REST_TIME = 2.0, 1.5  # a move lasts at least, and a rest after it [s]
+MAX_COMMANDED_SPEED, MAX_COMMANDED_SLIDE_SPEED = (
+    1.0,
+    0.25,
+)  # no joint is commanded faster [rad/s, m/s]
+MAX_REST_SPEED, MAX_REST_SLIDE_SPEED = 2e-3, 1e-3  # slower is at rest [rad/s, m/s]
+MINIMUM_JERK_PEAK_SPEED = 1.875  # largest speed of a minimum-jerk move of length 1 in time 1
+PARALLEL_RUNS = 4  # of neighbouring poses, whatever the machine: its results are those of any other
+TIMESTEPS_BETWEEN_FORCE_CHECKS = 10  # timesteps of a rest between two looks at its forces
 
 
 @dataclass(frozen=True, eq=False)
-class Driven:
+class DrivenPoses:
     """Where an arm was after its moves, row by row.
 
-    poses: (m, 4, 4) of the body that carries the targets, in the world [m].
-    q: (m, n) where the joints were [rad, m].  speed: (m,) largest of all joints, springs with them,
-    as a share of what counts as rest.  limited: (n,) share of the timesteps at which a joint's
-    actuator was at its force limit.
+    target_body_poses: (m, 4, 4) of the body that carries the targets, in the world [m]. q: (m, n)
+    where the joints were [rad, m].  relative_speed: (m,) largest of all joints, springs with them,
+    as a share of what counts as rest.  share_at_force_limit: (n,) share of the timesteps at which a
+    joint's actuator was at its force limit.
     """
 
-    poses: Array
+    target_body_poses: Array
     q: Array
-    speed: Array
-    limited: Array
+    relative_speed: Array
+    share_at_force_limit: Array
 
     @property
-    def moving(self) -> Array:
+    def is_moving(self) -> Array:
         """(m,) True where it had not come to rest."""
-        return self.speed > 1.0
+        return self.relative_speed > 1.0
 
 
-def drive(
-    chain: Chain,
+def drive_to_poses(
+    chain: ModelArm,
     commands: Array,
     source: str,
-    play: Array | None = None,
+    play_positions: Array | None = None,
     progress: Callable[[int], object] = lambda done: None,
-) -> Driven:
+) -> DrivenPoses:
     """Drive an arm from command to command and let it rest at each.
 
-    commands: (m, n) [rad, m].  play: (m, n) where each joint rests in its play [rad].
+    commands: (m, n) [rad, m].  play_positions: (m, n) where each joint rests in its play [rad].
     progress: called with the number of poses done.  The poses are dealt out to threads in runs of
     neighbours; each run begins at rest at the pose before its first one.
     Raises RobotError where MuJoCo finds that the model is unstable.
     """
-    if (chain.servos < 0).any():
-        return set_joints(chain, commands, play)
+    if (chain.servo_ids < 0).any():
+        return set_joints_without_servos(chain, commands, play_positions)
     count = len(commands)
-    runs = np.array_split(np.arange(count), min(RUNS, count))
+    runs = np.array_split(np.arange(count), min(PARALLEL_RUNS, count))
     lock, done = Lock(), [0]
 
     def heard() -> None:
@@ -142,33 +145,41 @@ def drive(
             done[0] += 1
             progress(done[0])
 
-    def one(rows: Array) -> list[Visit]:
-        sides = np.zeros(commands.shape) if play is None else play
-        return visits(chain, commands, sides, rows, source, heard)
+    def one(rows: Array) -> list[DrivenPose]:
+        sides = np.zeros(commands.shape) if play_positions is None else play_positions
+        return drive_run(chain, commands, sides, rows, source, heard)
 
     with ThreadPoolExecutor(min(len(runs), os.cpu_count() or 1)) as pool:
         found = zip(*(visit for part in pool.map(one, runs) for visit in part), strict=True)
         poses, q, speed, limited = map(np.array, found)
-    return Driven(poses, q, speed, limited.mean(axis=0))
+    return DrivenPoses(poses, q, speed, limited.mean(axis=0))
 
 
-Visit = tuple[Array, Array, float, Array]  # a row of `Driven`
+DrivenPose = tuple[Array, Array, float, Array]  # a row of `DrivenPoses`
 
 
-def visits(
-    chain: Chain,
+def drive_run(
+    chain: ModelArm,
     commands: Array,
-    play: Array,
+    play_positions: Array,
     rows: Array,
     source: str,
-    heard: Callable[[], object],
-) -> list[Visit]:
-    """A run of moves, one after the other, with a model of its own: a row each of `Driven`."""
+    report_pose: Callable[[], object],
+) -> list[DrivenPose]:
+    """A run of moves, one after the other, with a model of its own: a row each of `DrivenPoses`."""
     chain = replace(chain, model=copy(chain.model))
-    (mj, model, data, at, dofs), plays, carrier = chain.fresh(), chain.find_plays(), chain.carrier
-    joints, servos, moved = list(chain.joints), chain.servos, list(way_to(model, carrier))
+    (mj, model, data, at, dofs), plays, carrier = (
+        chain.new_data(),
+        chain.find_plays(),
+        chain.target_body,
+    )
+    joints, servos, moved = (
+        list(chain.joint_ids),
+        chain.servo_ids,
+        list(find_joint_path_to_body(model, carrier)),
+    )
     is_slide = model.jnt_type[moved] == mj.mjtJoint.mjJNT_SLIDE
-    rest = np.where(is_slide, STILL_SLIDE, STILL)
+    rest = np.where(is_slide, MAX_REST_SLIDE_SPEED, MAX_REST_SPEED)
 
     # Limits of actuators and joints, a little inside: rounding does not hide what is at one.
     inside, none = 1.0 - 1e-9, np.array([-np.inf, np.inf])
@@ -192,38 +203,44 @@ def visits(
         at_limit = (force <= low) | (force >= high) | (torque <= low_torque)
         return np.asarray(np.diff([*starts, len(path)]) @ (at_limit | (torque >= high_torque)))
 
-    step, start = chain.step, commands[rows[0] - 1]
+    step, start = chain.timestep, commands[rows[0] - 1]
     data.qpos[at], data.ctrl[servos] = start, start
-    fill_history(model, data)
-    count, out = round(REST / step), list[Visit]()
-    steer(np.tile(start, (count, 1)), LOOKS)
+    fill_command_history(model, data)
+    count, out = round(REST_TIME / step), list[DrivenPose]()
+    steer(np.tile(start, (count, 1)), TIMESTEPS_BETWEEN_FORCE_CHECKS)
     for row in rows:
         for joint, place in plays.items():
-            model.qpos_spring[place] = play[row, joint]
-        path = moves(start, commands[row], chain.robot.prismatic, step)
-        at_limit = steer(path) + steer(np.tile(commands[row], (count, 1)), LOOKS)
-        check_stable(mj, data, source)
+            model.qpos_spring[place] = play_positions[row, joint]
+        path = minimum_jerk_path(start, commands[row], chain.robot.prismatic, step)
+        at_limit = steer(path) + steer(
+            np.tile(commands[row], (count, 1)), TIMESTEPS_BETWEEN_FORCE_CHECKS
+        )
+        check_simulation_is_stable(mj, data, source)
         speed = float((np.abs(data.qvel[model.jnt_dofadr[moved]]) / rest).max())
         share = at_limit / (len(path) + count)
         out.append((body_pose(data, carrier), data.qpos[at], speed, share))
         start = commands[row]
-        heard()
+        report_pose()
     return out
 
 
-def moves(start: Array, end: Array, slides: Array, step: float) -> Array:
+def minimum_jerk_path(start: Array, end: Array, is_prismatic: Array, timestep: float) -> Array:
     """(steps, n) commands of a minimum-jerk move [Flash and Hogan 1985, eq. 3]."""
     way = end - start
-    needed = PEAK * np.abs(way) / np.where(slides, FASTEST_SLIDE, FASTEST)
-    count = max(1, round(max(MOVE, float(needed.max(initial=0.0))) / step))
+    needed = (
+        MINIMUM_JERK_PEAK_SPEED
+        * np.abs(way)
+        / np.where(is_prismatic, MAX_COMMANDED_SLIDE_SPEED, MAX_COMMANDED_SPEED)
+    )
+    count = max(1, round(max(MIN_MOVE_TIME, float(needed.max(initial=0.0))) / timestep))
     t = np.arange(1, count + 1)[:, None] / count
     return start + way * t**3 * (10.0 - 15.0 * t + 6.0 * t**2)
 
 
-def check_stable(mj: Any, data: Any, source: str) -> None:
+def check_simulation_is_stable(mujoco_module: Any, data: Any, source: str) -> None:
     """Raise RobotError where MuJoCo found numbers that no arm has, and began anew."""
-    for kind in (mj.mjtWarning.mjWARN_BADQPOS, mj.mjtWarning.mjWARN_BADQVEL,
-                 mj.mjtWarning.mjWARN_BADQACC):  # fmt: skip
+    for kind in (mujoco_module.mjtWarning.mjWARN_BADQPOS, mujoco_module.mjtWarning.mjWARN_BADQVEL,
+                 mujoco_module.mjtWarning.mjWARN_BADQACC):  # fmt: skip
         if data.warning[int(kind)].number:
             raise RobotError(
                 f"{source}: the simulation is unstable (MuJoCo: {kind.name}); give its servos "
@@ -231,28 +248,30 @@ def check_stable(mj: Any, data: Any, source: str) -> None:
             )
 
 
-def set_joints(chain: Chain, commands: Array, play: Array | None) -> Driven:
+def set_joints_without_servos(
+    chain: ModelArm, commands: Array, play_positions: Array | None
+) -> DrivenPoses:
     """The same for a model without servos: its joints are set and nothing moves."""
-    (mj, model, data, at, _), out = chain.fresh(), []
+    (mj, model, data, at, _), out = chain.new_data(), []
     for row in range(len(commands)):
         data.qpos[at] = commands[row]
         for joint, place in chain.find_plays().items():
-            data.qpos[place] = 0.0 if play is None else play[row, joint]
+            data.qpos[place] = 0.0 if play_positions is None else play_positions[row, joint]
         mj.mj_kinematics(model, data)
-        out.append(body_pose(data, chain.carrier))
+        out.append(body_pose(data, chain.target_body))
     still, limited = np.zeros(len(commands)), np.zeros(commands.shape[1])
-    return Driven(np.array(out), commands, still, limited)
+    return DrivenPoses(np.array(out), commands, still, limited)
 
 
-def touching(chain: Chain, model: Any, q: Array) -> Array:
+def find_poses_in_contact(chain: ModelArm, model: Any, joint_values: Array) -> Array:
     """(m,) True where the arm touches something, or itself, at joint values (m, n) [rad, m].
 
     model: that of the chain, with its contacts.
     """
-    mj, carried = mujoco(), chain.find_carrying_joints() >= 0
-    data, out = mj.MjData(model), np.zeros(len(q), dtype=bool)
-    for row, values in enumerate(q):
-        data.qpos[chain.places] = values
+    mj, carried = import_mujoco(), chain.find_carrying_joints() >= 0
+    data, out = mj.MjData(model), np.zeros(len(joint_values), dtype=bool)
+    for row, values in enumerate(joint_values):
+        data.qpos[chain.qpos_indices] = values
         mj.mj_fwdPosition(model, data)
         sides = carried[model.geom_bodyid[data.contact.geom]].any(axis=-1)
         out[row] = (sides & (data.contact.dist < 0.0)).any()
@@ -262,37 +281,44 @@ def touching(chain: Chain, model: Any, q: Array) -> Array:
 # ---- where a written file lets its targets stand -------------------------------------------------
 
 
-ROUNDS, CLOSE = 20, 1e-12  # of Newton's method, and the largest step that is none [rad, m]
-SMALL = 1e-7  # to find slopes of forces [rad, m]
+MAX_NEWTON_STEPS, MAX_CONVERGED_STEP = (
+    20,
+    1e-12,
+)  # of Newton's method, and the largest step that is none [rad, m]
+DIFFERENCE_STEP = 1e-7  # to find slopes of forces [rad, m]
 
 
 def measure_target_offsets(
-    chain: Chain, cell: Cell, arm: Arm, base: Array, data: Measurements
+    chain: ModelArm, cell: Cell, arm: SimulatedArm, base: Array, data: Measurements
 ) -> Array:
     """(m, k, 3) from where the targets of a written model stand to where the cell says [m].
 
     As the instrument sees it; the command map of the arm corrects the commands.
     base: (4, 4) of the arm in the model's world [m].
     """
-    commands = Commands(replace(cell, effects=arm.mapped)).follow(data)
-    points = stand(chain, data.target_names, commands, arm.rest_in_play(data))
-    to = cell.base @ inverse(base)
+    commands = Commands(replace(cell, effects=arm.mapped_effects)).follow(data)
+    points = find_target_positions_at_rest(
+        chain, data.target_names, commands, arm.find_play_positions(data)
+    )
+    to = cell.base @ invert_transform(base)
     chosen = [cell.target_names.index(name) for name in data.target_names]
-    expected = cell.seen(data)[:, chosen]
+    expected = cell.predict_in_first_session_frame(data)[:, chosen]
     return np.asarray(expected - points @ to[:3, :3].T - to[:3, 3])
 
 
-def stand(chain: Chain, names: tuple[str, ...], commands: Array, play: Array | None) -> Array:
+def find_target_positions_at_rest(
+    chain: ModelArm, target_names: tuple[str, ...], commands: Array, play_positions: Array | None
+) -> Array:
     """(m, k, 3) sites of these names, in the world, with all forces of the arm in balance [m].
 
-    commands: (m, n) [rad, m].  play: (m, n) where each joint rests in its play [rad].
+    commands: (m, n) [rad, m].  play_positions: (m, n) where each joint rests in its play [rad].
     """
     chain = replace(chain, model=copy(chain.model))
-    (mj, model, data, *_), sides, servos = chain.fresh(), chain.find_plays(), chain.servos
-    joints = list(way_to(model, int(model.site(names[0]).bodyid[0])))
+    (mj, model, data, *_), sides, servos = chain.new_data(), chain.find_plays(), chain.servo_ids
+    joints = list(find_joint_path_to_body(model, int(model.site(target_names[0]).bodyid[0])))
     at, dofs = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
     states = model.actuator_actadr[servos]
-    out = np.empty((len(commands), len(names), 3))
+    out = np.empty((len(commands), len(target_names), 3))
 
     def force(q: Array) -> Array:
         data.qpos[at] = q
@@ -301,63 +327,76 @@ def stand(chain: Chain, names: tuple[str, ...], commands: Array, play: Array | N
 
     for row, command in enumerate(commands):
         mj.mj_resetData(model, data)
-        data.qpos[chain.places] = data.ctrl[servos] = command
-        fill_history(model, data)
+        data.qpos[chain.qpos_indices] = data.ctrl[servos] = command
+        fill_command_history(model, data)
         data.act[states[states >= 0]] = command[states >= 0]
         for joint, place in sides.items():
-            data.qpos[place] = model.qpos_spring[place] = 0.0 if play is None else play[row, joint]
+            data.qpos[place] = model.qpos_spring[place] = (
+                0.0 if play_positions is None else play_positions[row, joint]
+            )
         q = data.qpos[at]
-        for _ in range(ROUNDS):
+        for _ in range(MAX_NEWTON_STEPS):
             here = force(q)
-            slope = np.array([force(q + step) - here for step in SMALL * np.eye(len(q))]).T / SMALL
+            slope = (
+                np.array([force(q + step) - here for step in DIFFERENCE_STEP * np.eye(len(q))]).T
+                / DIFFERENCE_STEP
+            )
             step = np.linalg.solve(slope, here)
             q = q - step
-            if np.abs(step).max() < CLOSE:
+            if np.abs(step).max() < MAX_CONVERGED_STEP:
                 break
         force(q)
-        out[row] = [data.site(name).xpos for name in names]
+        out[row] = [data.site(name).xpos for name in target_names]
     return out
 
 
 # ---- base and targets that suit given flange poses best ------------------------------------------
 
 
-PLACINGS = 30  # of Gauss and Newton, until a step is none
+MAX_GAUSS_NEWTON_STEPS = 30  # of Gauss and Newton, until a step is none
 
 
-def placed_error(
-    poses: Array, data: Measurements, train: Array, start: tuple[Array, Array]
+def compute_error_with_fitted_base(
+    flange_poses: Array,
+    data: Measurements,
+    is_training: Array,
+    start_base_and_targets: tuple[Array, Array],
 ) -> Array:
     """Measured minus predicted (m, k, 3), NaN where not measured [m].
 
-    poses: (m, 4, 4) of the flange in some base frame [m].  train: (m,) mask of the poses that place
-    base and targets.  start: base (4, 4) in the measurement frame and targets (k, 3) in the flange.
+    flange_poses: (m, 4, 4) of the flange in some base frame [m].  is_training: (m,) mask of the
+    poses that place base and targets.  start_base_and_targets: base (4, 4) in the measurement frame
+    and targets (k, 3) in the flange.
     """
-    turn, origin = start[0][:3, :3], start[0][:3, 3]
-    spots = start[1]
-    for _ in range(PLACINGS):
-        error, columns = linear(poses[train], data.y[train], turn, origin, spots)
+    turn, origin = start_base_and_targets[0][:3, :3], start_base_and_targets[0][:3, 3]
+    spots = start_base_and_targets[1]
+    for _ in range(MAX_GAUSS_NEWTON_STEPS):
+        error, columns = linearise_base_and_targets(
+            flange_poses[is_training], data.y[is_training], turn, origin, spots
+        )
         seen = np.isfinite(error).all(axis=-1)
         step = np.linalg.lstsq(
             columns[seen].reshape(-1, columns.shape[-1]), error[seen].reshape(-1), rcond=1e-10
         )[0]
         origin = origin + turn @ step[:3]
-        turn = turn @ rotation(step[3:6])
+        turn = turn @ rotation_from_vector(step[3:6])
         spots = spots + step[6:].reshape(-1, 3)
-        if np.abs(step).max() < CLOSE:
+        if np.abs(step).max() < MAX_CONVERGED_STEP:
             break
-    error, _ = linear(poses, data.y, turn, origin, spots)
+    error, _ = linearise_base_and_targets(flange_poses, data.y, turn, origin, spots)
     return error
 
 
-def linear(poses: Array, y: Array, turn: Array, origin: Array, spots: Array) -> tuple[Array, Array]:
+def linearise_base_and_targets(
+    poses: Array, y: Array, base_rotation: Array, base_origin: Array, target_positions: Array
+) -> tuple[Array, Array]:
     """Errors (m, k, 3) and their columns (m, k, 3, 6 + 3 k): shift, turn of the base; targets."""
-    inside = np.einsum("mij,kj->mki", poses[:, :3, :3], spots) + poses[:, None, :3, 3]
-    error = y - inside @ turn.T - origin
+    inside = np.einsum("mij,kj->mki", poses[:, :3, :3], target_positions) + poses[:, None, :3, 3]
+    error = y - inside @ base_rotation.T - base_origin
     m, k = inside.shape[:2]
     columns = np.zeros((m, k, 3, 6 + 3 * k))
-    columns[..., :3] = turn
-    columns[..., 3:6] = -turn @ hat(inside)
+    columns[..., :3] = base_rotation
+    columns[..., 3:6] = -base_rotation @ skew_matrix(inside)
     for i in range(k):
-        columns[:, i, :, 6 + 3 * i : 9 + 3 * i] = turn @ poses[:, :3, :3]
+        columns[:, i, :, 6 + 3 * i : 9 + 3 * i] = base_rotation @ poses[:, :3, :3]
     return error, columns

@@ -17,28 +17,33 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from minimax_cal.correcting.exporters.job import Export, Job, origins
-from minimax_cal.correcting.exporters.urdf import assumptions
-from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.files import write_whole
-from minimax_cal.modelling.cell import Cell, still
+from minimax_cal.compensation.exporters.export_job import ExportedFile, ExportJob, joint_origins
+from minimax_cal.compensation.exporters.urdf_file import describe_inertia_assumptions
+from minimax_cal.core.errors import OptionError
+from minimax_cal.core.files import write_file_atomically
+from minimax_cal.modelling.cell import Cell, build_measurements_at_rest
 from minimax_cal.modelling.effects.table import Fitted, Term
-from minimax_cal.robots.document import Document, Writing
-from minimax_cal.robots.gravity import G
-from minimax_cal.robots.mjcf import find_assets, mujoco, read_model
-from minimax_cal.robots.transforms import tail
-from minimax_cal.simulators.arm import Arm, arm_of, bare_parts, sample
-from minimax_cal.simulators.chain import ROBOT, Chain, ModelServos, chain_of
+from minimax_cal.robots.gravity_torques import STANDARD_GRAVITY
+from minimax_cal.robots.mjcf_import import import_mujoco, read_mujoco_model, set_asset_directories
+from minimax_cal.robots.transforms import a_alpha_beta_transform
+from minimax_cal.robots.xml_document import XmlDocument, XmlWriteOptions
+from minimax_cal.simulators.arm import (
+    SimulatedArm,
+    assign_effects_without_masses,
+    build_simulated_arm,
+    sample_workspace,
+)
+from minimax_cal.simulators.chain import ROBOT_TEXT_NAME, ModelArm, ModelServos, find_model_arm
 from minimax_cal.simulators.corrected_model import correct_model
 from minimax_cal.simulators.drive import measure_target_offsets
-from minimax_cal.simulators.elements import Layout, set_link_mass, write_arm_elements
+from minimax_cal.simulators.elements import ArmLayout, set_link_mass, write_arm_elements
 from minimax_cal.simulators.mjcf_tree import MjcfTree, add_element, pose_attributes
 
 ROD_RADIUS = 0.02  # of the links that are drawn [m]
 NEW_TIMESTEP = 0.002  # of a new file [s]
 
 
-def write(job: Job) -> Export:
+def write(job: ExportJob) -> ExportedFile:
     """A new MJCF, or the given one corrected; a command map beside it where effects need one.
 
     A given model keeps its own masses, unless those are assumed.
@@ -46,42 +51,48 @@ def write(job: Job) -> Export:
     """
     if not job.model:
         cell = job.cell or Cell(job.robot, np.eye(4), (), np.zeros((0, 3)))
-        arm, base = arm_of(cell, job.q), np.eye(4)
+        arm, base = build_simulated_arm(cell, job.q), np.eye(4)
         content = build_new_tree(arm, cell.target_names).to_bytes()
         beside, chain = dict[str, bytes](), None
-        notices: tuple[str, ...] = (assumptions(job.robot),)
+        notices: tuple[str, ...] = (describe_inertia_assumptions(job.robot),)
         if find_spec("mujoco") and cell.target_names:
-            model = mujoco().MjModel.from_xml_string(content.decode())
-            chain = chain_of(model, job.robot.joints, job.source)
+            model = import_mujoco().MjModel.from_xml_string(content.decode())
+            chain = find_model_arm(model, job.robot.joints, job.source)
     else:
         if job.cell is None or not job.fitted:
             raise OptionError(
                 f"{job.source}: mjcf= is corrected by a calibration: give one, not a robot"
             )
-        cell, given = job.cell, read_model(job.model)
-        chain = Chain.find(given, job.robot.joints, job.tip)
-        arm = arm_of(cell, job.q, chain.find_masses(job.nominal))
-        q = sample(job.robot) if job.q is None else job.q
+        cell, given = job.cell, read_mujoco_model(job.model)
+        chain = ModelArm.find(given, job.robot.joints, job.tip)
+        arm = build_simulated_arm(cell, job.q, chain.find_masses(job.nominal))
+        q = sample_workspace(job.robot) if job.q is None else job.q
         chain.check_force_limits(q, given.source)
         made = correct_model(given, chain, job.nominal, arm, cell.target_names)
-        chain = chain.in_model(given.compiled(made.document.root))  # before assets are renamed
+        chain = chain.with_model(
+            given.compile_model(made.document.root)
+        )  # before assets are renamed
         content, beside = format_document(made.document, given.folder, job.path)
         base, notices = made.base, made.notices
     offsets = None if chain is None else partial(measure_target_offsets, chain, cell, arm, base)
     beside |= arm.format_command_map(cell)
-    return Export(content, (*notices, *arm.list_limitations()), beside, offsets)
+    return ExportedFile(content, (*notices, *arm.list_limitations()), beside, offsets)
 
 
 def carries(cell: Cell) -> tuple[Term, ...]:
     """The effects of a cell that elements hold, or a command map; those of 0 need nothing."""
-    data = still(np.zeros((1, cell.robot.joints)), cell.target_names, cell.robot)
-    alone = ((term, replace(cell, effects=Fitted.of([(term, values)])))
-             for term, values in cell.effects.pairs)  # fmt: skip
-    return tuple(term for term, one in alone if not bare_parts(one, data).left_out)
+    data = build_measurements_at_rest(
+        np.zeros((1, cell.robot.joints)), cell.target_names, cell.robot
+    )
+    alone = ((term, replace(cell, effects=Fitted.from_pairs([(term, values)])))
+             for term, values in cell.effects.terms_with_values)  # fmt: skip
+    return tuple(
+        term for term, one in alone if not assign_effects_without_masses(one, data).left_out
+    )
 
 
 def format_document(
-    document: Document, source: Path, path: Path | None
+    document: XmlDocument, source: Path, path: Path | None
 ) -> tuple[bytes, dict[str, bytes]]:
     """The text of a changed document at path: beside the given one its bytes but for the changes.
 
@@ -91,23 +102,23 @@ def format_document(
     here = source.resolve()
     is_elsewhere = path is not None and path.resolve().parent != here
     if is_elsewhere and path is not None and any(e.get("file") for e in document.root.iter()):
-        find_assets(document.root, Path(os.path.relpath(here, path.resolve().parent)))
+        set_asset_directories(document.root, Path(os.path.relpath(here, path.resolve().parent)))
     if not document.pieces:
         return MjcfTree(document.root).to_bytes(), {}
-    how = Writing(is_elsewhere, path.stem if path else "")
-    return document.raw(how), how.beside
+    how = XmlWriteOptions(is_elsewhere, path.stem if path else "")
+    return document.to_bytes(how), how.beside
 
 
-def write_document(document: Document, source: Path, path: Path) -> None:
+def write_document(document: XmlDocument, source: Path, path: Path) -> None:
     """Write a changed document to a path, and what it includes and changed beside it."""
     content, beside = format_document(document, source, path)
     for ending, text in beside.items():
-        write_whole(path.with_suffix(ending), text)
-    write_whole(path, content)
+        write_file_atomically(path.with_suffix(ending), text)
+    write_file_atomically(path, content)
 
 
 def build_new_tree(
-    arm: Arm, target_names: Sequence[str], *, with_springs: bool = False
+    arm: SimulatedArm, target_names: Sequence[str], *, with_springs: bool = False
 ) -> MjcfTree:
     """A new file of an arm: bodies link1 ... linkn, masses, servos, springs, and rods to see.
 
@@ -117,12 +128,12 @@ def build_new_tree(
     root = ET.Element("mujoco", {"model": robot.name})
     root.append(ET.Comment(" written by minimax-cal; world = base of the robot; m, rad "))
     add_element(root, "compiler", angle="radian", autolimits="true")
-    add_element(root, "option", gravity=-G * robot.up, integrator="implicitfast",
+    add_element(root, "option", gravity=-STANDARD_GRAVITY * robot.up, integrator="implicitfast",
                 timestep=NEW_TIMESTEP)  # fmt: skip
     custom = add_element(root, "custom")
-    add_element(custom, "text", name=ROBOT, data=json.dumps(robot.to_dict()))
+    add_element(custom, "text", name=ROBOT_TEXT_NAME, data=json.dumps(robot.to_dict()))
     parent, bodies, joints = add_element(root, "worldbody"), [], []
-    for i, pose in enumerate(origins(robot)[:-1]):
+    for i, pose in enumerate(joint_origins(robot)[:-1]):
         at = pose_attributes(arm.mount @ pose if i == 0 else pose)
         parent = add_element(parent, "body", name=f"link{i + 1}", **at)
         bodies.append(parent)
@@ -138,7 +149,10 @@ def build_new_tree(
 
         # A rod along the joint axis and one along the link, that touch nothing.
         row, origin = robot.mdh[i], np.zeros(3)
-        for start, end in ((np.array([0.0, 0.0, -row[1]]), origin), (origin, tail(row)[:3, 3])):
+        for start, end in (
+            (np.array([0.0, 0.0, -row[1]]), origin),
+            (origin, a_alpha_beta_transform(row)[:3, 3]),
+        ):
             if np.linalg.norm(end - start) > ROD_RADIUS:
                 add_element(
                     parent, "geom", type="capsule", fromto=np.concatenate([start, end]),
@@ -148,7 +162,7 @@ def build_new_tree(
     axes = np.array([[0.0, 0.0, 1.0]]) * robot.sign[:, None]
     names = tuple(f"joint{i + 1}" for i in range(n))
     tree = MjcfTree(root)
-    layout = Layout(tree, names, tuple(bodies), tuple(joints),
+    layout = ArmLayout(tree, names, tuple(bodies), tuple(joints),
                     np.broadcast_to(np.eye(4), (n, 4, 4)), np.zeros((n, 3)), axes,
                     ModelServos.none(n), np.zeros(n), NEW_TIMESTEP)  # fmt: skip
     write_arm_elements(layout, arm, target_names, with_springs=with_springs)

@@ -9,16 +9,18 @@ from xml.etree import ElementTree as ET
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import RobotError
-from minimax_cal.robots.mjcf import mujoco, numbers
-from minimax_cal.simulators.chain import ORIENTATION_ATTRIBUTES, Chain, pose_in_parent
+from minimax_cal.core.arrays import Array
+from minimax_cal.core.errors import RobotError
+from minimax_cal.robots.mjcf_import import format_exact_numbers, import_mujoco
+from minimax_cal.simulators.chain import ORIENTATION_ATTRIBUTES, ModelArm, pose_in_parent
 
 
 def format_attributes(attributes: Mapping[str, object]) -> dict[str, str]:
     """Attributes as text; arrays become numbers that read back as the same ones."""
     return {
-        key: value if isinstance(value, str) else numbers(np.asarray(value, dtype=float))
+        key: value
+        if isinstance(value, str)
+        else format_exact_numbers(np.asarray(value, dtype=float))
         for key, value in attributes.items()
     }
 
@@ -63,19 +65,19 @@ class MjcfTree:
         """The parent of every element below the root."""
         return {child: parent for parent in self.root.iter() for child in parent}
 
-    def find_joints(self, chain: Chain) -> list[ET.Element]:
+    def find_joints(self, chain: ModelArm) -> list[ET.Element]:
         """The elements of an arm's joints, from the foot.
 
         Raises RobotError for joints without a name, and for two on one body.
         """
         world = [e for part in self.root.iter("worldbody") for e in part.iter("joint")]
         named = {e.get("name"): e for e in world if e.get("name")}
-        missing = [name or "one without a name" for name in chain.names if name not in named]
-        if missing or len(set(chain.bodies)) < len(chain.bodies):
+        missing = [name or "one without a name" for name in chain.joint_names if name not in named]
+        if missing or len(set(chain.body_ids)) < len(chain.body_ids):
             what = f"joint {missing[0]}" if missing else "two joints on one body"
-            source = chain.seen.urdf.source
+            source = chain.urdf_robot.urdf.source
             raise RobotError(f"{source}: {what}: give each joint a name and a body of its own")
-        return [named[name] for name in chain.names]
+        return [named[name] for name in chain.joint_names]
 
     def find_actuators(self, joint: str) -> list[ET.Element]:
         """The actuators that drive a joint of a name."""
@@ -112,7 +114,7 @@ class MjcfTree:
         pose = " ".join(f'{k}="{said[k]}"' for k in ("pos", *ORIENTATION_ATTRIBUTES) if k in said)
         units = " ".join(f'{k}="{compiler[k]}"' for k in ("angle", "eulerseq") if k in compiler)
         text = f"<mujoco><compiler {units}/><worldbody><body {pose}/></worldbody></mujoco>"
-        return pose_in_parent(mujoco().MjModel.from_xml_string(text), 1)
+        return pose_in_parent(import_mujoco().MjModel.from_xml_string(text), 1)
 
     @property
     def uses_degrees(self) -> bool:

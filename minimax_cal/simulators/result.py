@@ -10,21 +10,24 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from minimax_cal.dynamics.result import MotionEffect, table_by_joint
+from minimax_cal.core.display_text import capitalise_sentence
+from minimax_cal.core.files import to_plain_json
+from minimax_cal.core.record_fields import FieldFormat, derived_field
+from minimax_cal.core.results import Result
+from minimax_cal.core.tables import Table
+from minimax_cal.dynamics.result import MotionEffect, build_table_by_joint
 from minimax_cal.fitting.fit import Provenance
-from minimax_cal.ground.facts import Fact, derived
-from minimax_cal.ground.files import plain
-from minimax_cal.ground.results import Result
-from minimax_cal.ground.tables import Table
-from minimax_cal.ground.words import capitalise
-from minimax_cal.modelling.effects.words import name_step
+from minimax_cal.modelling.effects.effect_names import format_budget_step
 from minimax_cal.solvers.status import Status
 
-HOLDS, HOLDS_MM = 0.1, 0.02  # of an error: a simulator that holds what a fit claims [-, mm]
+MAX_RELATIVE_DEVIATION_FROM_FIT, MAX_DEVIATION_FROM_FIT_MM = (
+    0.1,
+    0.02,
+)  # of an error: a simulator that holds what a fit claims [-, mm]
 
 
 @dataclass(frozen=True)
-class Rung:
+class GapStep:
     """How far the simulator misses with a model, base and targets fitted to the training poses.
 
     why: what is wrong, or what this rung mends.  holdout_*, train_*: distances [mm].  sag_mrad:
@@ -45,10 +48,12 @@ class Rung:
     at_limit: float = 0.0
 
     @property
-    def holds(self) -> bool:
+    def agrees_with_fit(self) -> bool:
         """Whether the simulator does what the formulas of the fit say; True where none do."""
         off = abs(self.holdout_rms_mm - self.predicted_rms_mm)
-        return not off > max(HOLDS * self.predicted_rms_mm, HOLDS_MM)
+        return not off > max(
+            MAX_RELATIVE_DEVIATION_FROM_FIT * self.predicted_rms_mm, MAX_DEVIATION_FROM_FIT_MM
+        )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -66,12 +71,12 @@ class SimulatorGap(Result):
     COMMAND = "gap"
     model: str
     robot: str
-    rungs: Annotated[tuple[Rung, ...], Fact(fewest=1)]
-    commands: Annotated[Rung | None, Fact(key="with_commands")]
-    floor: Annotated[float, Fact(key="noise_floor_mm")]
-    floor_from: Annotated[str, Fact(key="noise_floor_from")]
-    train_poses: Annotated[int, Fact(key="poses.train")]
-    holdout_poses: Annotated[int, Fact(key="poses.holdout")]
+    rungs: Annotated[tuple[GapStep, ...], FieldFormat(fewest=1)]
+    commands: Annotated[GapStep | None, FieldFormat(key="with_commands")]
+    floor: Annotated[float, FieldFormat(key="noise_floor_mm")]
+    floor_from: Annotated[str, FieldFormat(key="noise_floor_from")]
+    train_poses: Annotated[int, FieldFormat(key="poses.train")]
+    holdout_poses: Annotated[int, FieldFormat(key="poses.holdout")]
     status: Status
     beyond: Mapping[str, Any]
     left_out: tuple[str, ...]
@@ -84,29 +89,31 @@ class SimulatorGap(Result):
         return f"<SimulatorGap of {self.model}: {self.headline()}>"
 
     @property
-    def every(self) -> tuple[Rung, ...]:
+    def all_steps(self) -> tuple[GapStep, ...]:
         """The rungs, and the one with the command map."""
         return (*self.rungs, *([self.commands] if self.commands else []))
 
-    @derived()
+    @derived_field()
     def holds(self) -> bool:
         """Whether what was corrected last, and its command map, do what the fit claims."""
-        return self.rungs[-1].holds and (self.commands is None or self.commands.holds)
+        return self.rungs[-1].agrees_with_fit and (
+            self.commands is None or self.commands.agrees_with_fit
+        )
 
     def table(self) -> Table:
         """The ladder."""
-        ladder = Table.of(
+        ladder = Table.from_records(
             f"{self.robot} in the simulator: errors on {self.holdout_poses} held-out poses",
-            [(name_step(rung.name), rung) for rung in self.every],
+            [(format_budget_step(rung.name), rung) for rung in self.all_steps],
             "0=model | 1.holdout_rms_mm=RMS mm .4f | 1.holdout_max_mm=max mm .4f | "
             "1.predicted_rms_mm=fit says mm .4f | 1.sag_mrad=joints off mrad .3f | 1.why=",
         )
         noise = ("noise floor", self.floor, None, None, None, self.floor_from)
-        return ladder.plus(noise) if math.isfinite(self.floor) else ladder
+        return ladder.with_rows(noise) if math.isfinite(self.floor) else ladder
 
     def first_tables(self) -> tuple[Table, ...]:
         """The ladder, without what explains its rungs."""
-        return (self.table().brief("model", "RMS mm", "max mm", "fit says mm"),)
+        return (self.table().shorten("model", "RMS mm", "max mm", "fit says mm"),)
 
     def headline(self) -> str:
         """The result in a sentence or two."""
@@ -120,7 +127,7 @@ class SimulatorGap(Result):
             most = max(range(len(falls)), key=falls.__getitem__)
             text += (
                 f"; corrected, by {last.holdout_rms_mm:.3f} mm (largest {last.holdout_max_mm:.3f} "
-                f"mm). Most is gained by: {name_step(self.rungs[most + 1].name)}"
+                f"mm). Most is gained by: {format_budget_step(self.rungs[most + 1].name)}"
             )
         if self.commands:
             text += f". With its command map {self.commands.holdout_rms_mm:.3f} mm remain"
@@ -138,11 +145,11 @@ class SimulatorGap(Result):
 # ---- along trajectories --------------------------------------------------------------------------
 
 
-COMMANDS = "the logged commands"  # that drive a model, as `drives` says at its end
+LOGGED_COMMANDS_TEXT = "the logged commands"  # that drive a model, as `drives` says at its end
 
 
 @dataclass(frozen=True)
-class MotionRung:
+class MotionGapStep:
     """How far a model misses on held-out runs, by joint.
 
     torque_rms_Nm: of the torque that the measured motion takes [N m, slides N].
@@ -170,7 +177,7 @@ class WrittenElement:
     attributes: str
     worth: Mapping[str, tuple[float, float]]
 
-    def words(self, unit: str) -> str:
+    def format_worth(self, unit: str) -> str:
         """For people: where it counts most [unit]."""
         if not self.worth:
             return f"{self.name} ({self.attributes})"
@@ -179,17 +186,17 @@ class WrittenElement:
         return f"{self.name} ({self.attributes}): {size} held out"
 
 
-def of_drive(one: MotionEffect) -> str:
+def describe_drive_effect(effect: MotionEffect) -> str:
     """What a drive has that the model's has not, and its worth, for people."""
     amounts = ", ".join(
         f"{p.name.replace('_', ' ')} {p.value:.4g}" + f" ± {p.sigma:.1g}" * (p.sigma > 0.0)
-        + f" {p.unit}" * (p.unit != "1") for p in one.parameters if p.value or p.sigma
+        + f" {p.unit}" * (p.unit != "1") for p in effect.parameters if p.value or p.sigma
     )  # fmt: skip
-    if not one.worth:
-        return f"not in the file: {one.words} ({amounts}), for which MuJoCo has no element"
-    joint, (before, after) = one.best
+    if not effect.worth:
+        return f"not in the file: {effect.words} ({amounts}), for which MuJoCo has no element"
+    joint, (before, after) = effect.joint_of_largest_gain
     size = f"joint error at {joint} {before:.3g} to {after:.3g} mrad"
-    return f"corrected {one.words} ({amounts}): {size} held out"
+    return f"corrected {effect.words} ({amounts}): {size} held out"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -208,7 +215,7 @@ class MotionGap(Result):
     model: str
     robot: str
     unit: str
-    rungs: Annotated[tuple[MotionRung, ...], Fact(fewest=1)]
+    rungs: Annotated[tuple[MotionGapStep, ...], FieldFormat(fewest=1)]
     elements: tuple[WrittenElement, ...]
     left_out: tuple[str, ...]
     drives: str
@@ -228,18 +235,18 @@ class MotionGap(Result):
         return f"<MotionGap of {self.model}: {self.headline()}>"
 
     @property
-    def commanded(self) -> bool:
+    def is_driven_by_commands(self) -> bool:
         """Whether logged commands drove the model."""
-        return self.drives.endswith(COMMANDS)
+        return self.drives.endswith(LOGGED_COMMANDS_TEXT)
 
     @property
-    def kept(self) -> bool:
+    def has_corrections(self) -> bool:
         """Whether something was kept, where commands drove the model."""
-        return not self.commanded or len(self.rungs) > 1
+        return not self.is_driven_by_commands or len(self.rungs) > 1
 
     def headline(self) -> str:
         """The result in a sentence or two."""
-        if not self.kept:
+        if not self.has_corrections:
             error = np.linalg.norm(self.rungs[0].tracking_rms_mrad)
             return (
                 f"No correction lowers the joint error under {self.drives} on held-out motion "
@@ -247,7 +254,7 @@ class MotionGap(Result):
             )
         first, last = self.rungs[0], self.rungs[-1]
         if not first.torque_rms:
-            return f"{capitalise(self.driven())}."
+            return f"{capitalise_sentence(self.describe_joint_error())}."
         share = np.array(last.torque_rms_moving) / np.maximum(first.torque_rms_moving, 1e-300)
         worst = int(np.argmax(share))
         said = (
@@ -255,32 +262,32 @@ class MotionGap(Result):
             f"{100.0 * np.median(share):.2g} % (median of the joints; worst J{worst + 1}, "
             f"{100.0 * share[worst]:.2g} %)"
         )
-        return f"{said}, {self.driven()}." if first.tracking_rms_mrad else f"{said}."
+        return f"{said}, {self.describe_joint_error()}." if first.tracking_rms_mrad else f"{said}."
 
-    def driven(self) -> str:
+    def describe_joint_error(self) -> str:
         """How the joint error changes."""
         ends = [np.linalg.norm(self.rungs[k].tracking_rms_mrad) for k in (0, -1)]
         return f"the joint error under {self.drives} from {ends[0]:.3g} to {ends[1]:.3g} mrad"
 
     def sentences(self) -> tuple[str, ...]:
         """What was corrected and its worth, and what the file does not hold."""
-        drives = (of_drive(one) for one in self.effects)
-        each = (f"corrected {one.words(self.unit)}" for one in self.elements)
+        drives = (describe_drive_effect(one) for one in self.effects)
+        each = (f"corrected {one.format_worth(self.unit)}" for one in self.elements)
         return (*drives, *each, *(f"not in the model: {text}" for text in self.left_out))
 
-    def short(self) -> dict[str, Any]:
+    def summarise_file(self) -> dict[str, Any]:
         """What another result says of the file that was written."""
         names = ("written", "elements", "left_out")
-        return {name: plain(getattr(self, name)) for name in names}
+        return {name: to_plain_json(getattr(self, name)) for name in names}
 
     def table(self) -> Table:
         """RMS torque of each joint, rung by rung."""
         title = f"RMS torque [{self.unit}] while moving, held out ({', '.join(self.held_out)})"
-        return table_by_joint(title, "model", self.rungs, "torque_rms_moving")
+        return build_table_by_joint(title, "model", self.rungs, "torque_rms_moving")
 
     def tables(self) -> tuple[Table, ...]:
         """Torques, and joint errors where drives moved the arm."""
         title = f"RMS joint error [mrad] under {self.drives}"
-        driven = table_by_joint(title, "model", self.rungs, "tracking_rms_mrad")
+        driven = build_table_by_joint(title, "model", self.rungs, "tracking_rms_mrad")
         own = (self.table(),) if self.unit else ()
         return (*own, driven) if self.drives else own

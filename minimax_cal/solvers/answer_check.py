@@ -6,24 +6,26 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from minimax_cal.ground.arrays import Array
-from minimax_cal.solvers.derivatives import measure_lengths
+from minimax_cal.core.arrays import Array
+from minimax_cal.solvers.derivatives import measure_variable_lengths
 from minimax_cal.solvers.iterate import MIN_VALUE_OF_TERMS
 from minimax_cal.solvers.linearisation import (
     Kkt,
     Linearisation,
     Scaling,
-    balance_multipliers,
     constraint_excess,
+    fit_multipliers_by_least_squares,
     measure_kkt,
 )
 from minimax_cal.solvers.max_problem import EPS, MaxOfFunctions
 
-FLAT = 1e-6  # gradients below, relative to the lengths and the level, count as none
-NEARBY = 1e-3  # distance, in lengths, at which a better point is looked for
-MIN_ROUNDINGS = 10.0  # of x, over which functions change by more than their own rounding
-MIN_FALL = 1e6  # lengths of the variables over which functions without end fall at least
-MIN_DROP_RATIO = 0.5  # of a fall to the one before, over ways that grow alike
+MAX_FLAT_GRADIENT = 1e-6  # gradients below, relative to the lengths and the level, count as none
+DESCENT_SEARCH_DISTANCE = 1e-3  # distance, in lengths, at which a better point is looked for
+MIN_CHANGE_IN_ROUNDINGS = 10.0  # of x, over which functions change by more than their own rounding
+MIN_UNBOUNDED_FALL_LENGTHS = (
+    1e6  # lengths of the variables over which functions without end fall at least
+)
+MIN_UNBOUNDED_DROP_RATIO = 0.5  # of a fall to the one before, over ways that grow alike
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +42,7 @@ class AnswerCheck:
     level: float
 
 
-def check_answer(
+def measure_answer_optimality(
     problem: MaxOfFunctions, x: Array, mu: Array, lam: Array, start: Array, tolerance: float
 ) -> AnswerCheck:
     """Stationarity, complementarity and violation at x, everything measured there.
@@ -49,50 +51,63 @@ def check_answer(
     those that do it best.  start: (n,) where the search began, whose rounding x has.  Slopes by
     differences are taken as central ones.
     """
-    here = problem.linearise_best(x)
-    size = min(abs(float(here.f.max())), find_variation(problem, here.f, mu, x, start))
+    here = problem.linearise_with_best_accuracy(x)
+    size = min(
+        abs(float(here.f.max())), value_variation_along_variables(problem, here.f, mu, x, start)
+    )
     weights = np.where(mu > EPS, mu, 0.0)  # less is the rounding of a QP's answer
     terms = float(weights @ (np.abs(here.f) + np.abs(here.jacobian) @ np.abs(x)))
     level = max(size, MIN_VALUE_OF_TERMS * terms) or 1.0
     check = measure_optimality(problem, here, x, mu, lam, level)
     if check.kkt.residual <= tolerance:
         return check
-    check = min(check, balance_at_answer(problem, here, x, level), key=residual_of)
+    check = min(
+        check, measure_optimality_with_fitted_multipliers(problem, here, x, level), key=kkt_residual
+    )
     if check.kkt.residual <= tolerance or check.kkt.violation > tolerance:
         return check
-    zero_level = find_zero_level(problem, here.f, check.mu, x, start)
+    zero_level = value_rounding_level(problem, here.f, check.mu, x, start)
     if abs(float(here.f.max())) > zero_level:
         return check
     level = max(level, zero_level / tolerance)
     trials = (
         check,
         measure_optimality(problem, here, x, check.mu, check.lam, level),
-        balance_at_answer(problem, here, x, level),
+        measure_optimality_with_fitted_multipliers(problem, here, x, level),
     )
-    return min(trials, key=residual_of)
+    return min(trials, key=kkt_residual)
 
 
-def residual_of(check: AnswerCheck) -> float:
+def kkt_residual(check: AnswerCheck) -> float:
     """The largest of its three residuals."""
     return check.kkt.residual
 
 
 def measure_optimality(
-    problem: MaxOfFunctions, here: Linearisation, x: Array, mu: Array, lam: Array, level: float
+    problem: MaxOfFunctions,
+    linearisation: Linearisation,
+    x: Array,
+    mu: Array,
+    lam: Array,
+    level: float,
 ) -> AnswerCheck:
     """The residuals for given multipliers, where a change of the value by `level` matters."""
-    scaling = find_local_scaling(problem, here, x, mu, level)
-    scaled, lower, upper = scaling.apply(here), problem.lower / scaling.c, problem.upper / scaling.c
+    scaling = find_local_scaling(problem, linearisation, x, mu, level)
+    scaled, lower, upper = (
+        scaling.apply(linearisation),
+        problem.lower / scaling.c,
+        problem.upper / scaling.c,
+    )
     scaled_lam = lam * scaling.c / level
     kkt = measure_kkt(scaled, mu, scaled_lam, lower, upper)
     # Multipliers of nearly equal rows may be huge: what cancels then shows nothing beyond the
     # rounding of the rows' entries.
-    uncertain = (problem.rows.slope_rounding(x) * np.abs(scaled_lam)) @ np.abs(scaled.normal)
+    uncertain = (problem.rows.derivative_rounding(x) * np.abs(scaled_lam)) @ np.abs(scaled.normal)
     # A gain is quadratic in what is left of smooth gradients: below the root of the values'
     # rounding it is less than that rounding.
-    smooth = np.sqrt(EPS * float(mu @ np.abs(here.f)) / level)
+    smooth = np.sqrt(EPS * float(mu @ np.abs(linearisation.f)) / level)
     left = kkt.stationarity + float(uncertain.max(initial=0.0))
-    violations = problem.relative_violations(x, here.c, here.normal)
+    violations = problem.relative_violations(x, linearisation.c, linearisation.normal)
     kkt = Kkt(
         0.0 if left <= smooth else left,
         kkt.complementarity,
@@ -101,19 +116,23 @@ def measure_optimality(
     return AnswerCheck(kkt, mu, lam, level)
 
 
-def balance_at_answer(
-    problem: MaxOfFunctions, here: Linearisation, x: Array, level: float
+def measure_optimality_with_fitted_multipliers(
+    problem: MaxOfFunctions, linearisation: Linearisation, x: Array, level: float
 ) -> AnswerCheck:
     """The residuals for the multipliers that balance the gradients best."""
-    even = np.full(len(here.f), 1.0 / len(here.f))
-    scaling = find_local_scaling(problem, here, x, even, level)
-    scaled, lower, upper = scaling.apply(here), problem.lower / scaling.c, problem.upper / scaling.c
-    mu, lam = balance_multipliers(scaled, lower, upper)
-    return measure_optimality(problem, here, x, mu, lam * level / scaling.c, level)
+    even = np.full(len(linearisation.f), 1.0 / len(linearisation.f))
+    scaling = find_local_scaling(problem, linearisation, x, even, level)
+    scaled, lower, upper = (
+        scaling.apply(linearisation),
+        problem.lower / scaling.c,
+        problem.upper / scaling.c,
+    )
+    mu, lam = fit_multipliers_by_least_squares(scaled, lower, upper)
+    return measure_optimality(problem, linearisation, x, mu, lam * level / scaling.c, level)
 
 
 def find_local_scaling(
-    problem: MaxOfFunctions, here: Linearisation, x: Array, mu: Array, level: float
+    problem: MaxOfFunctions, linearisation: Linearisation, x: Array, mu: Array, level: float
 ) -> Scaling:
     """Scaling of value, variables and rows at x, for a level of the value.
 
@@ -126,32 +145,40 @@ def find_local_scaling(
         return np.atleast_1d(mu[mu > 0.0] @ problem.values(z)[mu > 0.0])
 
     low, high = problem.low, problem.high
-    alone = measure_lengths(problem.values, x, low, high, level, problem.lengths)
-    weighted = measure_lengths(weigh, x, low, high, level, problem.lengths)
+    alone = measure_variable_lengths(problem.values, x, low, high, level, problem.lengths)
+    weighted = measure_variable_lengths(weigh, x, low, high, level, problem.lengths)
     lengths = np.maximum(np.minimum(weighted, np.maximum(alone, np.abs(x))), alone)
-    return Scaling.from_lengths(here, level, lengths, problem.lower, problem.upper)
+    return Scaling.from_lengths(linearisation, level, lengths, problem.lower, problem.upper)
 
 
-def find_variation(problem: MaxOfFunctions, f: Array, mu: Array, x: Array, start: Array) -> float:
+def value_variation_along_variables(
+    problem: MaxOfFunctions, f: Array, mu: Array, x: Array, start: Array
+) -> float:
     """By how much moving a variable, by itself or back to the start, changes the largest functions.
 
     It bounds what counts as the size of the value: a number added to all functions is no size.
     """
-    return find_largest_change(problem, f, mu, x, np.maximum(np.abs(x), np.abs(x - start)))
+    return largest_weighted_change(problem, f, mu, x, np.maximum(np.abs(x), np.abs(x - start)))
 
 
-def find_zero_level(problem: MaxOfFunctions, f: Array, mu: Array, x: Array, start: Array) -> float:
+def value_rounding_level(
+    problem: MaxOfFunctions, f: Array, mu: Array, x: Array, start: Array
+) -> float:
     """A value that counts as zero: by how much rounding of x changes the largest functions.
 
     x is known to the rounding of itself and of the way from the start; a smooth minimiser to the
     root of its rounding.  f: (m,) at x.
     """
     rounding = EPS * np.maximum(np.abs(x), np.abs(x - start))
-    bends = find_largest_change(problem, f, mu, x, np.sqrt(EPS) * np.abs(x), is_second_order=True)
-    return MIN_ROUNDINGS * max(find_largest_change(problem, f, mu, x, rounding), bends)
+    bends = largest_weighted_change(
+        problem, f, mu, x, np.sqrt(EPS) * np.abs(x), is_second_order=True
+    )
+    return MIN_CHANGE_IN_ROUNDINGS * max(
+        largest_weighted_change(problem, f, mu, x, rounding), bends
+    )
 
 
-def find_largest_change(
+def largest_weighted_change(
     problem: MaxOfFunctions,
     f: Array,
     mu: Array,
@@ -185,11 +212,11 @@ def find_descent_from_stationary_point(problem: MaxOfFunctions, x: Array) -> Arr
     here = problem.linearise(x)
     worst, reach = float(here.f.max()), np.maximum(np.abs(x), problem.lengths)
     level = float(np.abs(here.f).max()) or 1.0
-    active = here.f >= worst - FLAT * level
-    if np.abs(here.jacobian[active] * reach).max(initial=0.0) > FLAT * level:
+    active = here.f >= worst - MAX_FLAT_GRADIENT * level
+    if np.abs(here.jacobian[active] * reach).max(initial=0.0) > MAX_FLAT_GRADIENT * level:
         return None
-    best, found = worst - FLAT**2 * level, None
-    for step in NEARBY * np.concatenate([np.diag(reach), -np.diag(reach)]):
+    best, found = worst - MAX_FLAT_GRADIENT**2 * level, None
+    for step in DESCENT_SEARCH_DISTANCE * np.concatenate([np.diag(reach), -np.diag(reach)]):
         f, c = problem.evaluate(x + step)
         inside = np.all(c >= problem.lower) and np.all(c <= problem.upper)
         if inside and np.all(np.isfinite(f)) and f.max() < best:
@@ -197,26 +224,28 @@ def find_descent_from_stationary_point(problem: MaxOfFunctions, x: Array) -> Arr
     return found
 
 
-def falls_without_end(problem: MaxOfFunctions, start: Array, end: Array, tolerance: float) -> bool:
+def falls_without_end(
+    problem: MaxOfFunctions, start: Array, far_point: Array, tolerance: float
+) -> bool:
     """Whether the largest function falls on and on along the way from a start to an end.
 
     problem: in the units of the start, which meets the constraints.  Asked from one length of the
-    variables to the end, and at least to `MIN_FALL` lengths, in steps that grow alike; what falls
-    by less and less, as 1/x, comes to an end.
+    variables to the end, and at least to `MIN_UNBOUNDED_FALL_LENGTHS` lengths, in steps that grow
+    alike; what falls by less and less, as 1/x, comes to an end.
     """
-    way = end - start
+    way = far_point - start
     length_count = float(np.abs(way / np.maximum(problem.lengths, np.abs(start))).max())
     if not 0.0 < length_count < np.inf:
         return False
     last_value, last_drop = float(problem.values(start).max()), 0.0
-    decade_count = int(np.ceil(np.log10(max(length_count, MIN_FALL))))
+    decade_count = int(np.ceil(np.log10(max(length_count, MIN_UNBOUNDED_FALL_LENGTHS))))
     for share in np.logspace(0, decade_count, 2 * decade_count + 1) / length_count:
         x = start + share * way
         f, c = problem.evaluate(x)
         reach = np.abs(problem.rows.jacobian(x)) @ np.maximum(np.abs(x), problem.lengths)
         is_inside = np.all(constraint_excess(c, problem.lower, problem.upper) <= tolerance * reach)
         drop = last_value - float(f.max())
-        if not (is_inside and drop > MIN_DROP_RATIO * last_drop):
+        if not (is_inside and drop > MIN_UNBOUNDED_DROP_RATIO * last_drop):
             return False
         last_value, last_drop = last_value - drop, drop
     return True

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from minimax_cal.ground.arrays import Array
+from minimax_cal.core.arrays import Array
 from minimax_cal.solvers.linearisation import Linearisation
 
 EPS = float(np.finfo(float).eps)
@@ -14,18 +14,20 @@ EPS = float(np.finfo(float).eps)
 
 @dataclass(frozen=True, eq=False)
 class Bfgs:
-    """matrix: (p, p) positive definite.  fresh: whether it is a guess that no step has changed."""
+    """matrix: (p, p) positive definite.  is_guess: whether it is a guess that no step has
+    changed.
+    """
 
     matrix: Array
-    fresh: bool
+    is_guess: bool
 
     @staticmethod
-    def start(here: Linearisation, curvature: Array) -> Bfgs:
+    def from_linearisation(linearisation: Linearisation, default_diagonal: Array) -> Bfgs:
         """The mean Gauss-Newton Hessian where there is one, else a guess of its diagonal (p,)."""
-        mean = here.curvature(np.full(len(here.f), 1.0 / len(here.f)))
+        mean = linearisation.curvature(np.full(len(linearisation.f), 1.0 / len(linearisation.f)))
         if len(mean):
-            return Bfgs(mean + 1e-3 * np.diag(np.diag(mean)), fresh=False)
-        return Bfgs(np.diag(curvature), fresh=True)
+            return Bfgs(mean + 1e-3 * np.diag(np.diag(mean)), is_guess=False)
+        return Bfgs(np.diag(default_diagonal), is_guess=True)
 
     def update(
         self, s: Array, before: Linearisation, after: Linearisation, mu: Array, lam: Array
@@ -36,7 +38,7 @@ class Bfgs:
         if length == 0.0 or not np.all(np.isfinite(q)):
             return self
         matrix = self.matrix
-        if self.fresh and q @ s > 0:  # size of the first guess [Nocedal and Wright, eq. 6.20]
+        if self.is_guess and q @ s > 0:  # size of the first guess [Nocedal and Wright, eq. 6.20]
             guess = np.diag(matrix)
             matrix = float(q @ (q / guess)) / float(q @ s) * matrix
         bs = matrix @ s
@@ -51,7 +53,7 @@ class Bfgs:
         new = 0.5 * (new + new.T)
         if not is_positive_definite(new):  # by rounding, of entries of many sizes
             new = np.diag(np.maximum(np.diag(new), EPS * np.diag(matrix)))
-        return Bfgs(new, fresh=False)
+        return Bfgs(new, is_guess=False)
 
 
 def is_positive_definite(matrix: Array) -> bool:

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from scipy.optimize import Bounds, LinearConstraint, NonlinearConstraint
 
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import OptionError
+from minimax_cal.core.arrays import Array
+from minimax_cal.core.errors import OptionError
 from minimax_cal.solvers.derivatives import (
     EPS,
     CountedFunction,
@@ -48,13 +48,13 @@ class ConstraintRows:
         Raises OptionError where sizes or a kind do not fit.
         """
         n = len(x)
-        blocks = [] if bounds is None else [bound_rows(bounds, n)]
+        blocks = [] if bounds is None else [bounds_to_linear_rows(bounds, n)]
         bound_count = sum(len(matrix) for matrix, _, _ in blocks)
         parts, ends = [], []
         for given in constraints:
-            constraint = from_dictionary(given)
+            constraint = constraint_from_dictionary(given)
             if isinstance(constraint, LinearConstraint):
-                blocks.append(linear_rows(constraint, n))
+                blocks.append(constraint_to_linear_rows(constraint, n))
             elif isinstance(constraint, NonlinearConstraint):
                 function = CountedFunction(constraint.fun)
                 kind = constraint.jac
@@ -63,7 +63,7 @@ class ConstraintRows:
                 values = function(x)
                 if not np.all(np.isfinite(values)):
                     raise OptionError("minimize_max: a constraint at x0 is no finite number")
-                ends.append(spread_ends(constraint, len(values)))
+                ends.append(broadcast_constraint_ends(constraint, len(values)))
             else:
                 raise OptionError(
                     "minimize_max: constraints are scipy.optimize's LinearConstraint and "
@@ -87,12 +87,14 @@ class ConstraintRows:
 
     def best_jacobian(self, x: Array) -> Array:
         """c'(x): (l, n), by central differences in place of forward ones."""
-        return np.concatenate([self.linear, *(jacobian.best(x) for _, jacobian in self.parts)])
+        return np.concatenate(
+            [self.linear, *(jacobian.best_accuracy_jacobian(x) for _, jacobian in self.parts)]
+        )
 
-    def slope_rounding(self, x: Array) -> Array:
+    def derivative_rounding(self, x: Array) -> Array:
         """(l,) relative error of each row's derivative."""
         linear = np.full(len(self.linear), EPS)
-        curved = (np.full(len(fun(x)), jacobian.rounding) for fun, jacobian in self.parts)
+        curved = (np.full(len(fun(x)), jacobian.relative_rounding) for fun, jacobian in self.parts)
         return np.concatenate([linear, *curved])
 
     def take_bounds(self) -> ConstraintRows:
@@ -101,7 +103,7 @@ class ConstraintRows:
         return ConstraintRows(self.linear[:k], k, (), self.lower[:k], self.upper[:k])
 
 
-def from_dictionary(given: Any) -> Any:
+def constraint_from_dictionary(given: Any) -> Any:
     """A constraint as it is, or of a dictionary of type, fun, jac, args.  Raises OptionError."""
     if not isinstance(given, Mapping):
         return given
@@ -139,7 +141,7 @@ def split_values_and_jacobian(
     )
 
 
-def read_bounds(bounds: Any, n: int) -> Bounds | None:
+def parse_bounds(bounds: Any, n: int) -> Bounds | None:
     """SciPy's Bounds of n variables, from pairs too, None where open.  Raises OptionError."""
     if bounds is None or isinstance(bounds, Bounds):
         return bounds
@@ -152,24 +154,29 @@ def read_bounds(bounds: Any, n: int) -> Bounds | None:
     return Bounds(low, high)
 
 
-def bound_rows(bounds: Bounds, n: int) -> tuple[Array, Array, Array]:
+def bounds_to_linear_rows(bounds: Bounds, variable_count: int) -> tuple[Array, Array, Array]:
     """Matrix, lower and upper side of the bounds that are not open."""
-    low, high = (np.broadcast_to(side, n).astype(float) for side in (bounds.lb, bounds.ub))
+    low, high = (
+        np.broadcast_to(side, variable_count).astype(float) for side in (bounds.lb, bounds.ub)
+    )
     closed = np.isfinite(low) | np.isfinite(high)
-    return np.eye(n)[closed], low[closed], high[closed]
+    return np.eye(variable_count)[closed], low[closed], high[closed]
 
 
-def linear_rows(constraint: LinearConstraint, n: int) -> tuple[Array, Array, Array]:
+def constraint_to_linear_rows(
+    constraint: LinearConstraint, variable_count: int
+) -> tuple[Array, Array, Array]:
     """Matrix, lower and upper side.  Raises OptionError where the matrix does not fit x."""
     matrix = to_dense_matrix(constraint.A)
-    if matrix.shape[1] != n:
+    if matrix.shape[1] != variable_count:
         raise OptionError(
-            f"minimize_max: a LinearConstraint has {matrix.shape[1]} columns, x has {n}"
+            f"minimize_max: a LinearConstraint has {matrix.shape[1]}"
+            f" columns, x has {variable_count}"
         )
-    return matrix, *spread_ends(constraint, len(matrix))
+    return matrix, *broadcast_constraint_ends(constraint, len(matrix))
 
 
-def spread_ends(constraint: Any, row_count: int) -> tuple[Array, Array]:
+def broadcast_constraint_ends(constraint: Any, row_count: int) -> tuple[Array, Array]:
     """Lower and upper end of each row, from scalars or vectors.  Raises OptionError."""
     try:
         low, high = (

@@ -7,21 +7,25 @@ from typing import Any
 
 import numpy as np
 
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import OptionError
+from minimax_cal.core.arrays import Array
+from minimax_cal.core.errors import OptionError
 
 Function = Callable[[Array], Array]
-SCHEMES = ("cs", "3-point", "2-point")
+DERIVATIVE_SCHEMES = ("cs", "3-point", "2-point")
 COMPLEX_STEP = 1e-30
 EPS = float(np.finfo(float).eps)
 
-PROBE = 1e-4  # step of a probe, relative to the length of the variable
-MIN_PROBE = 1e-12  # relative to the variable: less is its rounding
-MAX_PROBES = 40  # of one length
+RELATIVE_PROBE_STEP = 1e-4  # step of a probe, relative to the length of the variable
+MIN_RELATIVE_PROBE_STEP = 1e-12  # relative to the variable: less is its rounding
+MAX_PROBES_PER_LENGTH = 40  # of one length
 MAX_LENGTH_RATIO = 1e4  # by which one probe may lengthen a variable's length
-CHECKED_DIRECTIONS = 3  # in which a given gradient is compared with differences
-NEARBY = 1e-3  # distance of the second place of that check, relative to the lengths
-MAX_SLOPE_ERROR = 1e-2  # relative to the steepest slope; above it, the gradient is wrong
+GRADIENT_CHECK_DIRECTIONS = 3  # in which a given gradient is compared with differences
+GRADIENT_CHECK_DISTANCE = (
+    1e-3  # distance of the second place of that check, relative to the lengths
+)
+MAX_RELATIVE_GRADIENT_ERROR = (
+    1e-2  # relative to the steepest slope; above it, the gradient is wrong
+)
 
 
 class CountedFunction:
@@ -51,7 +55,7 @@ class CountedJacobian:
         self, function: Function, scheme: Callable[[Array], Any] | str, lengths: Array
     ) -> None:
         """Raises OptionError for an unknown scheme."""
-        if not callable(scheme) and scheme not in SCHEMES:
+        if not callable(scheme) and scheme not in DERIVATIVE_SCHEMES:
             raise OptionError(
                 f"minimize_max: jac {scheme!r}: give a function, True, 'cs', '3-point' or '2-point'"
             )
@@ -65,19 +69,19 @@ class CountedJacobian:
             return to_dense_matrix(self.scheme(x.copy()))
         if self.scheme == "cs":
             return complex_step_jacobian(self.function, x, self.lengths)
-        return self.differences(x, self.scheme == "3-point")
+        return self.difference_jacobian_at(x, self.scheme == "3-point")
 
-    def best(self, x: Array) -> Array:
+    def best_accuracy_jacobian(self, x: Array) -> Array:
         """(m, n) at x, by central differences in place of forward ones."""
-        return self.differences(x, True) if self.scheme == "2-point" else self(x)
+        return self.difference_jacobian_at(x, True) if self.scheme == "2-point" else self(x)
 
-    def differences(self, x: Array, central: bool) -> Array:
+    def difference_jacobian_at(self, x: Array, central: bool) -> Array:
         """(m, n) at x by central or forward differences."""
         steps = np.maximum(np.abs(x), self.lengths)
         return difference_jacobian(self.function, x, steps, central)
 
     @property
-    def rounding(self) -> float:
+    def relative_rounding(self) -> float:
         """Relative error of slopes: that of numbers, or that of central differences."""
         return EPS ** (2.0 / 3.0) if self.scheme in ("2-point", "3-point") else EPS
 
@@ -123,21 +127,21 @@ def complex_step_jacobian(function: Function, x: Array, lengths: Array) -> Array
     )
 
 
-def measure_lengths(
-    function: Function, x: Array, lower: Any, upper: Any, level: float, first: Array
+def measure_variable_lengths(
+    function: Function, x: Array, lower: Any, upper: Any, level: float, initial_lengths: Array
 ) -> Array:
     """(n,) over which a variable alone takes some function above the largest by `level`.
 
     By slopes and curvatures, since either may vanish at x; at most the width of its bounds.
-    first: (n,) a guess; it, or |x|, is kept where no function depends on the variable.
+    initial_lengths: (n,) a guess; it, or |x|, is kept where no function depends on the variable.
     """
     f = function(x)
     room = level + (f.max(initial=0.0) - f if len(f) else f)
     width = np.where(upper > lower, np.subtract(upper, lower), np.inf)
-    first = lengths = np.minimum(first, width)
+    initial_lengths = lengths = np.minimum(initial_lengths, width)
     with np.errstate(all="ignore"):  # a value beside x may be infinite
-        for _ in range(MAX_PROBES):
-            steps = np.maximum(PROBE * lengths, MIN_PROBE * np.abs(x))
+        for _ in range(MAX_PROBES_PER_LENGTH):
+            steps = np.maximum(RELATIVE_PROBE_STEP * lengths, MIN_RELATIVE_PROBE_STEP * np.abs(x))
             no_room_above, no_room_below = x + steps > upper, x - steps < lower
             ahead_steps = np.diag(np.where(no_room_above, 0.0, steps))
             back_steps = np.diag(np.where(no_room_below, 0.0, steps))
@@ -152,14 +156,16 @@ def measure_lengths(
             change = np.maximum(np.abs(ahead - back) / 2.0, np.sqrt(np.abs(ahead + back)))
             seen = change.max(axis=1, initial=0.0)
             seen = np.where(np.isfinite(seen), seen, 1.0)
-            found = np.minimum(steps / np.maximum(seen, PROBE / MAX_LENGTH_RATIO), width)
+            found = np.minimum(
+                steps / np.maximum(seen, RELATIVE_PROBE_STEP / MAX_LENGTH_RATIO), width
+            )
             if np.all((found >= 0.1 * lengths) & (found <= 10.0 * lengths)):
                 break
             lengths = np.where(found < lengths, found, np.sqrt(found * lengths))
-    return np.where(seen > 0.0, found, np.minimum(np.maximum(first, np.abs(x)), width))
+    return np.where(seen > 0.0, found, np.minimum(np.maximum(initial_lengths, np.abs(x)), width))
 
 
-def find_wrong_function(
+def find_function_with_wrong_gradient(
     function: Function, jacobian: Function, x: Array, lower: Any, upper: Any, lengths: Array
 ) -> int | None:
     """Index of a function whose gradient differs from its differences; None if there is none.
@@ -169,13 +175,13 @@ def find_wrong_function(
     rng = np.random.default_rng(0)
     reach = np.maximum(np.abs(x), lengths)
     found: list[set[int]] = []
-    beside = x + NEARBY * reach * rng.uniform(-1.0, 1.0, size=len(x))
+    beside = x + GRADIENT_CHECK_DISTANCE * reach * rng.uniform(-1.0, 1.0, size=len(x))
     for place in (x, np.clip(beside, lower, upper)):
         slopes, values = jacobian(place), function(place)
         if not (np.all(np.isfinite(slopes)) and np.all(np.isfinite(values))):
             return None
         wrong = np.zeros(len(values), dtype=bool)
-        for _ in range(CHECKED_DIRECTIONS):
+        for _ in range(GRADIENT_CHECK_DIRECTIONS):
             way = EPS ** (1.0 / 3.0) * reach * rng.normal(size=len(x))
             ends = np.clip(place + way, lower, upper), np.clip(place - way, lower, upper)
             with np.errstate(all="ignore"):
@@ -185,6 +191,8 @@ def find_wrong_function(
                 bent = 2.0 * np.abs(ahead + back - 2.0 * values)  # more than differences miss
                 steep = np.linalg.norm(slopes * way, axis=1) + np.abs(seen)
                 error = np.abs(seen - said)
-                wrong |= np.isfinite(error) & (error > MAX_SLOPE_ERROR * steep + rounding + bent)
+                wrong |= np.isfinite(error) & (
+                    error > MAX_RELATIVE_GRADIENT_ERROR * steep + rounding + bent
+                )
         found.append(set(np.flatnonzero(wrong).tolist()))
     return min(found[0] & found[1], default=None)

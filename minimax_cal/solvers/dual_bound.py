@@ -12,14 +12,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from minimax_cal.ground.arrays import Array
-from minimax_cal.solvers.least_squares import solve_normal
+from minimax_cal.core.arrays import Array
+from minimax_cal.solvers.least_squares import solve_normal_equations
 
-INACTIVE = 1e-6  # share of the mean multiplier that every point has when stationarity is repaired
+INACTIVE_MULTIPLIER_SHARE = (
+    1e-6  # share of the mean multiplier that every point has when stationarity is repaired
+)
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class LinearisedNorms:
     """Vectors and constraints with their first derivatives at a point.
 
     r: (n, w).  J: (n, w, p) of r.  c: (l,).  C: (l, p) of c.
@@ -37,7 +39,7 @@ class Rows:
 
 
 @dataclass(frozen=True, eq=False)
-class Multipliers:
+class NormMultipliers:
     """y: (n, w) one vector for each norm.  lam: (l,) > 0 at an upper bound, < 0 at a lower one.
 
     At a solution sum_i J_i'y_i + C'lam = 0, the |y_i| sum to one and y_i lies along r_i.
@@ -47,24 +49,30 @@ class Multipliers:
     lam: Array
 
 
-def gap_of(value: float, bound: float) -> float:
+def relative_duality_gap(value: float, bound: float) -> float:
     """(value - bound) / value."""
     return (value - bound) / value if value > 0.0 else 0.0
 
 
-def aligned(rows: Rows, mu: Array, lam: Array) -> Multipliers:
+def align_multipliers_with_residuals(
+    rows: LinearisedNorms, mu: Array, lam: Array
+) -> NormMultipliers:
     """Multipliers mu (n,) of the norms as vectors along r_i, brought to sum one with lam (l,)."""
     norms, total = rows.norms, max(float(mu.sum()), 1e-300)
     unit = rows.r / np.where(norms > 0.0, norms, 1.0)[:, None]
-    return Multipliers(mu[:, None] * unit / total, lam / total)
+    return NormMultipliers(mu[:, None] * unit / total, lam / total)
 
 
-def of_squares(rows: Rows, mu: Array, lam: Array) -> Multipliers:
+def convert_squared_norm_multipliers(
+    rows: LinearisedNorms, mu: Array, lam: Array
+) -> NormMultipliers:
     """The same from the multipliers of max |r_i|^2, whose gradients are 2 |r_i| times longer."""
-    return aligned(rows, 2.0 * mu * rows.norms, lam)
+    return align_multipliers_with_residuals(rows, 2.0 * mu * rows.norms, lam)
 
 
-def lower_bound(rows: Rows, lower: Array, upper: Array, given: Multipliers) -> float:
+def dual_lower_bound(
+    rows: LinearisedNorms, lower: Array, upper: Array, multipliers: NormMultipliers
+) -> float:
     """No step d brings max |r_i + J_i d| below this while lower <= c + C d <= upper.
 
     Weak duality, computed from the multipliers alone; nothing that a solver claims is used.  They
@@ -73,24 +81,24 @@ def lower_bound(rows: Rows, lower: Array, upper: Array, given: Multipliers) -> f
     charged over the ball of radius sqrt(sum (B + |r_i|)^2) / smallest singular value of J, outside
     of which no |r_i + J_i d| can all be below B.
     """
-    lam = np.where(np.isinf(upper), np.minimum(given.lam, 0.0), given.lam)
+    lam = np.where(np.isinf(upper), np.minimum(multipliers.lam, 0.0), multipliers.lam)
     lam = np.where(np.isinf(lower), np.maximum(lam, 0.0), lam)
-    y = balanced(rows, given.y, lam)
+    y = restore_stationarity(rows, multipliers.y, lam)
     total = np.linalg.norm(y, axis=1).sum()
     if not total > 0.0:
         return 0.0
     y, lam = y / total, lam / total
-    free = dual_value(rows, lower, upper, Multipliers(y, lam), 0.0)
+    free = dual_value(rows, lower, upper, NormMultipliers(y, lam), 0.0)
     if not free > 0.0:
         return 0.0
     flat = rows.J.reshape(-1, rows.J.shape[-1])
     values = np.linalg.eigvalsh(flat.T @ flat)
     least = values[0] - 1e-14 * len(values) * values[-1]  # rounding must not make it larger
     reach = np.sqrt(((free + rows.norms) ** 2).sum() / least) if least > 0.0 else np.inf
-    return max(dual_value(rows, lower, upper, Multipliers(y, lam), float(reach)), 0.0)
+    return max(dual_value(rows, lower, upper, NormMultipliers(y, lam), float(reach)), 0.0)
 
 
-def balanced(rows: Rows, y: Array, lam: Array) -> Array:
+def restore_stationarity(rows: LinearisedNorms, y: Array, lam: Array) -> Array:
     """(n, w) multipliers near y with sum_i J_i'y_i + C'lam = 0, as far as J allows.
 
     Each may change in proportion to its size; a small share more lets others help where the active
@@ -98,21 +106,23 @@ def balanced(rows: Rows, y: Array, lam: Array) -> Array:
     """
     flat = rows.J.reshape(-1, rows.J.shape[-1])
     size = np.linalg.norm(y, axis=1)
-    weight = np.repeat(size + INACTIVE * size.mean(), y.shape[1])
+    weight = np.repeat(size + INACTIVE_MULTIPLIER_SHARE * size.mean(), y.shape[1])
     gram = flat.T @ (weight[:, None] * flat)
     for _ in range(3):  # twice more takes what rounding left
         rest = flat.T @ y.reshape(-1) + rows.C.T @ lam
-        move = flat @ solve_normal(gram, rest[:, None])[:, 0]
+        move = flat @ solve_normal_equations(gram, rest[:, None])[:, 0]
         y = y - (weight * move).reshape(y.shape)
     return y
 
 
-def dual_value(rows: Rows, lower: Array, upper: Array, given: Multipliers, radius: float) -> float:
+def dual_value(
+    rows: LinearisedNorms, lower: Array, upper: Array, multipliers: NormMultipliers, radius: float
+) -> float:
     """Least of sum y_i'(r_i + J_i d) + lam'(c + C d - bound) over |d| <= radius.
 
     The multipliers are made smaller if the |y_i| sum to more than one.
     """
-    y, lam = given.y, given.lam
+    y, lam = multipliers.y, multipliers.lam
     total = max(float(np.linalg.norm(y, axis=1).sum()), 1.0)
     edge = np.where(lam > 0.0, upper, np.where(lam < 0.0, lower, rows.c))
     rest = np.linalg.norm(np.einsum("nw,nwp->p", y, rows.J) + rows.C.T @ lam)

@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from minimax_cal.ground.arrays import Array
+from minimax_cal.core.arrays import Array
 from minimax_cal.solvers.iterate import FLAT_CURVATURE, Iterate, X
 from minimax_cal.solvers.linearisation import Linearisation, Scaling, constraint_excess
 from qp_backends import Problem, Solution
@@ -93,19 +93,23 @@ class SearchStep:
 
     @staticmethod
     def from_qp(
-        answer: Solution, here: Linearisation, working_set: Array, scaling: Scaling
+        answer: Solution, linearisation: Linearisation, working_set: Array, scaling: Scaling
     ) -> SearchStep:
         """Step and multipliers of a QP answer; mu is brought back to sum one exactly.
 
         working_set: the functions that the QP knew.  scaling: of the QP.
         """
-        k, p = here.jacobian.shape
-        usable, count = has_answer(answer), len(working_set)
+        k, p = linearisation.jacobian.shape
+        usable, count = has_usable_answer(answer), len(working_set)
         mu = np.zeros(k) if usable else np.full(k, 1.0 / k)
         if usable:
             mu[working_set] = np.maximum(answer.y[:count], 0.0)
         total = mu.sum()
-        lam = answer.y[count : count + len(here.c)] if usable else np.zeros(len(here.c))
+        lam = (
+            answer.y[count : count + len(linearisation.c)]
+            if usable
+            else np.zeros(len(linearisation.c))
+        )
         return SearchStep(
             d=answer.x[:p] * scaling.x if usable else np.zeros(p),
             mu=mu / total if total > 0.0 else np.full(k, 1.0 / k),
@@ -134,7 +138,11 @@ def solve_subproblem(
     is_curved = curvature > 0.0
     lengths = 1.0 / np.sqrt(np.where(is_curved, curvature, 1.0))
     scaling = replace(iterate.scaling, x=np.where(is_curved, lengths, iterate.descent_lengths))
-    values = iterate.here if f is None or c is None else replace(iterate.here, f=f, c=c)
+    values = (
+        iterate.linearisation
+        if f is None or c is None
+        else replace(iterate.linearisation, f=f, c=c)
+    )
     here = scaling.apply(values)
     hessian = hessian / scaling.value * np.outer(scaling.x, scaling.x)
     lower, upper = iterate.problem.lower / scaling.c, iterate.problem.upper / scaling.c
@@ -146,71 +154,78 @@ def solve_subproblem(
     missed = working_set = iterate.select_largest_functions(here)
     while len(missed):
         some = here if len(working_set) == len(here.f) else here.take_functions(working_set)
-        qp = epigraph_qp(some, here.f.max(), hessian, lower, upper, decrease)
+        qp = build_epigraph_qp(some, here.f.max(), hessian, lower, upper, decrease)
         answer = solve_qp(qp)
         missed = find_functions_above(here, working_set, answer)
         working_set = np.concatenate([working_set, missed])
-    if has_answer(answer) or not len(here.c):
+    if has_usable_answer(answer) or not len(here.c):
         return SearchStep.from_qp(answer, here, working_set, scaling)
 
     # Elastic mode [Nocedal and Wright, sec. 18.5]: violations are allowed at a penalty well above
     # what the functions could gain by them.
     penalties = np.maximum(iterate.penalties, ELASTIC_PENALTY_FACTOR * iterate.minimal_penalties)
-    answer = solve_qp(elastic_qp(qp, len(working_set), penalties * scaling.c / scaling.value))
+    answer = solve_qp(build_elastic_qp(qp, len(working_set), penalties * scaling.c / scaling.value))
     step = SearchStep.from_qp(answer, here, working_set, scaling)
     return replace(step, elastic_penalties=penalties)
 
 
-def has_answer(answer: Solution) -> bool:
+def has_usable_answer(answer: Solution) -> bool:
     """Whether a QP has an answer, exact or not: what it is good for the search finds out."""
     return answer.usable or (
         answer.status is QpStatus.INACCURATE and bool(np.isfinite(answer.x).all())
     )
 
 
-def find_functions_above(here: Linearisation, working_set: Array, answer: Solution) -> Array:
+def find_functions_above(
+    linearisation: Linearisation, working_set: Array, answer: Solution
+) -> Array:
     """Functions beyond the working set that an answer of the epigraph QP makes larger than v.
 
     All, where there is no answer; else at most as many as there are variables.
     """
-    k, p = here.jacobian.shape
+    k, p = linearisation.jacobian.shape
     if len(working_set) == k:
         return working_set[:0]
-    if not has_answer(answer):
+    if not has_usable_answer(answer):
         return np.setdiff1d(np.arange(k), working_set)
-    over = here.f - here.f.max() + here.jacobian @ answer.x[:p] - answer.x[p]
+    over = (
+        linearisation.f
+        - linearisation.f.max()
+        + linearisation.jacobian @ answer.x[:p]
+        - answer.x[p]
+    )
     over[working_set] = -np.inf
     found = np.flatnonzero(over > 0.0)
     return found[np.argsort(-over[found])[:p]]
 
 
-def epigraph_qp(
-    here: Linearisation,
+def build_epigraph_qp(
+    linearisation: Linearisation,
     largest: float,
     hessian: Array,
     lower: Array,
     upper: Array,
-    decrease: float,
+    expected_decrease: float,
 ) -> Problem:
     """min 1/2 d'Hd + v with rows f - largest + f'd <= v and lower - c <= c'd <= upper - c.
 
-    decrease: about how far v may fall.
+    expected_decrease: about how far v may fall.
     """
-    k, p = here.jacobian.shape
-    rows = np.zeros((k + len(here.c), p + 1))
-    rows[:k, :p], rows[:k, p], rows[k:, :p] = here.jacobian, -1.0, here.normal
+    k, p = linearisation.jacobian.shape
+    rows = np.zeros((k + len(linearisation.c), p + 1))
+    rows[:k, :p], rows[:k, p], rows[k:, :p] = linearisation.jacobian, -1.0, linearisation.normal
     quadratic = np.zeros((p + 1, p + 1))
     quadratic[:p, :p] = hessian
-    curvature = NEGLIGIBLE_FORCE / max(decrease, FLAT_CURVATURE)
+    curvature = NEGLIGIBLE_FORCE / max(expected_decrease, FLAT_CURVATURE)
     quadratic[p, p] = min(max(curvature, FLAT_CURVATURE), MAX_DECREASE_CURVATURE)
     linear = np.zeros(p + 1)
     linear[p] = 1.0
-    low = np.concatenate([np.full(k, -np.inf), lower - here.c])
-    high = np.concatenate([largest - here.f, upper - here.c])
+    low = np.concatenate([np.full(k, -np.inf), lower - linearisation.c])
+    high = np.concatenate([largest - linearisation.f, upper - linearisation.c])
     return Problem(quadratic, linear, rows, low, high)
 
 
-def elastic_qp(problem: Problem, function_count: int, penalties: Array) -> Problem:
+def build_elastic_qp(problem: Problem, function_count: int, penalties: Array) -> Problem:
     """The same QP with slacks s, t >= 0 on its constraint rows: c'd + s - t, at a penalty (l,)."""
     n, m, k = len(problem.q), len(problem.l), function_count
     slack = np.zeros((m, 2 * (m - k)))
@@ -232,17 +247,17 @@ def update_penalties(iterate: Iterate[X], step: SearchStep, tolerance: float) ->
         largest = np.abs(step.lam * c).max(initial=0.0)
         return np.asarray(np.maximum(iterate.penalties, MULTIPLIER_PENALTY_FACTOR * largest / c))
     penalties = np.maximum(iterate.penalties, step.elastic_penalties)
-    here, d = iterate.scaling.apply(iterate.here), step.d / iterate.reach
-    if lowers_violation(here, d, lower / c, upper / c, tolerance):
+    here, d = iterate.scaling.apply(iterate.linearisation), step.d / iterate.reach
+    if does_step_lower_violation(here, d, lower / c, upper / c, tolerance):
         return penalties
     is_hopeless = np.all(penalties > MAX_PENALTY * iterate.minimal_penalties)
     return None if is_hopeless else 10.0 * penalties
 
 
-def lowers_violation(
-    here: Linearisation, d: Array, lower: Array, upper: Array, tolerance: float
+def does_step_lower_violation(
+    linearisation: Linearisation, step: Array, lower: Array, upper: Array, tolerance: float
 ) -> bool:
     """Whether constraints are met to a tolerance, or the elastic QP's step d (p,) lowers them."""
-    now = constraint_excess(here.c, lower, upper).sum()
-    ahead = constraint_excess(here.c + here.normal @ d, lower, upper).sum()
+    now = constraint_excess(linearisation.c, lower, upper).sum()
+    ahead = constraint_excess(linearisation.c + linearisation.normal @ step, lower, upper).sum()
     return bool(now <= tolerance or ahead <= (1.0 - 1e-6) * now)

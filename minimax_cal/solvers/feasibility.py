@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from minimax_cal.ground.arrays import Array
+from minimax_cal.core.arrays import Array
 from minimax_cal.solvers.derivatives import CountedFunction, CountedJacobian
 from minimax_cal.solvers.max_problem import MaxOfFunctions
 from minimax_cal.solvers.status import Status
 
 if TYPE_CHECKING:
-    from minimax_cal.solvers.minimize import Search
+    from minimax_cal.solvers.minimize import OptimumSearch
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +28,9 @@ class FeasibilityAnswer:
     is_proven: bool
 
 
-def find_feasible_point(problem: MaxOfFunctions, x: Array, search: Search) -> FeasibilityAnswer:
+def find_feasible_point(
+    problem: MaxOfFunctions, x: Array, search: OptimumSearch
+) -> FeasibilityAnswer:
     """Minimise the largest violation, each relative to its row's terms, between the bounds.
 
     The same search from x (n,), with the QPs that it has left; they count among its own.

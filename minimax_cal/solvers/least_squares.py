@@ -13,11 +13,11 @@ from typing import Generic, Protocol, Self, TypeVar
 
 import numpy as np
 
-from minimax_cal.ground.arrays import Array
+from minimax_cal.core.arrays import Array
 from minimax_cal.solvers.status import Status
 
 
-class Point(Protocol):
+class IterateBatch(Protocol):
     """A batch of iterates that can be picked apart."""
 
     def take(self, rows: Array) -> Self:
@@ -27,10 +27,10 @@ class Point(Protocol):
         """The batch with some members replaced."""
 
 
-X = TypeVar("X", bound=Point)
+X = TypeVar("X", bound=IterateBatch)
 
 
-class Separable(Protocol[X]):
+class SeparableProblem(Protocol[X]):
     """min over (r, omega) of |y - Phi(omega) r|^2, for a batch of B iterates."""
 
     @property
@@ -51,7 +51,7 @@ class Separable(Protocol[X]):
 
 
 @dataclass(frozen=True)
-class Method:
+class LeastSquaresMethod:
     """separable: eliminate the lengths.  damped: Levenberg-Marquardt instead of Gauss-Newton.
 
     full: Golub and Pereyra's Jacobian; False is Kaufman's, which drops its second term.
@@ -62,33 +62,35 @@ class Method:
     full: bool = True
 
 
-METHODS = {
-    "nlgn": Method(separable=False, damped=False),
-    "nllm": Method(separable=False, damped=True),
-    "snlgn": Method(separable=True, damped=False),
-    "snllm": Method(separable=True, damped=True),
-    "snlgn-kaufman": Method(separable=True, damped=False, full=False),
-    "snllm-kaufman": Method(separable=True, damped=True, full=False),
+LEAST_SQUARES_METHODS = {
+    "nlgn": LeastSquaresMethod(separable=False, damped=False),
+    "nllm": LeastSquaresMethod(separable=False, damped=True),
+    "snlgn": LeastSquaresMethod(separable=True, damped=False),
+    "snllm": LeastSquaresMethod(separable=True, damped=True),
+    "snlgn-kaufman": LeastSquaresMethod(separable=True, damped=False, full=False),
+    "snllm-kaufman": LeastSquaresMethod(separable=True, damped=True, full=False),
 }
 
 # For starts that are mostly near: plain Gauss-Newton steps where they lead straight down, else the
 # damped method.  AUTO's are those of snlgn; JOINT's are in all parameters at once, and cheaper.
-AUTO, JOINT = "auto", "joint"
-DAMPED = "snllm"
+AUTO_METHOD_NAME, JOINT_METHOD_NAME = "auto", "joint"
+DAMPED_METHOD_NAME = "snllm"
 
 
-def method_of(name: str) -> Method:
+def find_method(name: str) -> LeastSquaresMethod:
     """The method called name; of auto and joint that for a start that may be far."""
-    return METHODS[DAMPED if name in (AUTO, JOINT) else name]
+    return LEAST_SQUARES_METHODS[
+        DAMPED_METHOD_NAME if name in (AUTO_METHOD_NAME, JOINT_METHOD_NAME) else name
+    ]
 
 
-def name_of(method: Method) -> str:
+def find_method_name(method: LeastSquaresMethod) -> str:
     """What a method is called."""
-    return next(name for name, known in METHODS.items() if known == method)
+    return next(name for name, known in LEAST_SQUARES_METHODS.items() if known == method)
 
 
 @dataclass(frozen=True)
-class Limits:
+class LeastSquaresLimits:
     """When to stop.
 
     step: root mean square motion of a point that a step would cause [the residual's unit].
@@ -101,12 +103,12 @@ class Limits:
     damping: float = 1e-3
 
 
-NEAR = Limits(damping=1e-9)
-MOST_DAMPING = 1e12  # beyond it no step leads on
+NEAR_START_LIMITS = LeastSquaresLimits(damping=1e-9)
+MAX_LEAST_SQUARES_DAMPING = 1e12  # beyond it no step leads on
 
 
 @dataclass(frozen=True, eq=False)
-class LeastSquares(Generic[X]):
+class LeastSquaresSolution(Generic[X]):
     """x: the batch of solutions.  cost, iterations: (B,).  status: B of them.
 
     trace: (iterations + 1, B) cost at each iterate, constant after a member has ended.
@@ -118,50 +120,55 @@ class LeastSquares(Generic[X]):
     iterations: Array
     status: tuple[Status, ...]
     trace: Array
-    method: Method
+    method: LeastSquaresMethod
 
 
 @np.errstate(over="ignore", invalid="ignore")  # an undamped step may diverge: a status says so
 def solve(
-    problem: Separable[X],
-    start: X,
-    count: int,
-    points: float,
-    method: Method = METHODS["snllm"],
-    limits: Limits = Limits(),
+    problem: SeparableProblem[X],
+    starts: X,
+    start_count: int,
+    residual_point_count: float,
+    method: LeastSquaresMethod = LEAST_SQUARES_METHODS["snllm"],
+    limits: LeastSquaresLimits = LeastSquaresLimits(),
     progress: Callable[[int], None] = lambda iteration: None,
     *,
-    trace: bool = True,
-) -> LeastSquares[X]:
-    """Minimise from each of `count` starts [paper S, Algorithm 1; damping by Nielsen's rule].
+    keep_trace: bool = True,
+) -> LeastSquaresSolution[X]:
+    """Minimise from each of `start_count` starts [paper S, Algorithm 1; damping by Nielsen's rule].
 
-    points: number of residual points, which turns a sum of squares into a mean motion.
-    trace: whether to keep the cost of every iteration; else only those of start and end.
+    residual_point_count: number of residual points, which turns a sum of squares into a mean
+    motion. keep_trace: whether to keep the cost of every iteration; else only those of start and
+    end.
     """
-    at = examine(problem, start, method)
+    at = linearise_iterates(problem, starts, method)
     x, cost = at.x, at.cost
     costs = [cost]
-    status = [Status.ITERATION_LIMIT] * count
-    iterations = np.zeros(count, dtype=int)
-    damping, growth = np.full(count, limits.damping), np.full(count, 2.0)
-    alive = np.arange(count)  # the members still iterating
+    status = [Status.ITERATION_LIMIT] * start_count
+    iterations = np.zeros(start_count, dtype=int)
+    damping, growth = np.full(start_count, limits.damping), np.full(start_count, 2.0)
+    alive = np.arange(start_count)  # the members still iterating
     for iteration in range(1, limits.iterations + 1):
         if not len(alive):
             break
         progress(iteration)
-        trial, motion, gain = tried(problem, at, damping[alive] * method.damped, points, method)
+        trial, motion, gain = take_trial_step(
+            problem, at, damping[alive] * method.damped, residual_point_count, method
+        )
         accept = np.isfinite(trial.cost) & np.isfinite(motion)
         done = accept & (motion <= limits.step)
         ended, failure = done | ~accept, Status.FAILED
         if method.damped:
-            lower, ratio = compared(at, trial, gain)
+            lower, ratio = compare_trial_costs(at, trial, gain)
             accept &= lower | done
-            damping[alive], growth[alive] = nielsen(damping[alive], growth[alive], accept, ratio)
-            ended, failure = done | (damping[alive] > MOST_DAMPING), Status.STALLED
+            damping[alive], growth[alive] = update_damping_by_nielsen(
+                damping[alive], growth[alive], accept, ratio
+            )
+            ended, failure = done | (damping[alive] > MAX_LEAST_SQUARES_DAMPING), Status.STALLED
         at = trial if accept.all() else at.put(np.flatnonzero(accept), trial)
         cost = cost.copy()
         cost[alive] = at.cost
-        if trace:
+        if keep_trace:
             costs.append(cost)
         iterations[alive] = iteration
         if ended.any():
@@ -172,38 +179,52 @@ def solve(
             alive, at = alive[stay], at.take(stay)
     if len(alive):
         x = x.put(alive, at.x)
-    costs = costs if trace else [*costs, cost]
-    return LeastSquares(x, cost, iterations, tuple(status), np.stack(costs), method)
+    costs = costs if keep_trace else [*costs, cost]
+    return LeastSquaresSolution(x, cost, iterations, tuple(status), np.stack(costs), method)
 
 
-def tried(
-    problem: Separable[X], at: Examined[X], damping: Array, points: float, method: Method
-) -> tuple[Examined[X], Array, Array]:
+def take_trial_step(
+    problem: SeparableProblem[X],
+    iterates: LinearisedIterates[X],
+    damping: Array,
+    residual_point_count: float,
+    method: LeastSquaresMethod,
+) -> tuple[LinearisedIterates[X], Array, Array]:
     """Iterates a step ahead, the mean motion (B,) of a point, and the decrease (B,) predicted."""
-    short, gain = damped_step(at, damping)
-    square = np.einsum("bi,bij,bj->b", short, at.matrix, short)
-    motion = np.sqrt(np.maximum(square, 0.0) / points)
-    move = lift(problem.linear, short, at.gradient, at.gram, method)
-    return examine(problem, problem.step(at.x, move), method), motion, gain
+    short, gain = solve_damped_step(iterates, damping)
+    square = np.einsum("bi,bij,bj->b", short, iterates.matrix, short)
+    motion = np.sqrt(np.maximum(square, 0.0) / residual_point_count)
+    move = extend_step_to_all_parameters(
+        problem.linear, short, iterates.gradient, iterates.gram, method
+    )
+    return linearise_iterates(problem, problem.step(iterates.x, move), method), motion, gain
 
 
-def compared(at: Examined[X], trial: Examined[X], gain: Array) -> tuple[Array, Array]:
+def compare_trial_costs(
+    iterates: LinearisedIterates[X], trial: LinearisedIterates[X], predicted_decrease: Array
+) -> tuple[Array, Array]:
     """(B,) True where a trial costs less; the decrease over the one predicted, 0 to 1."""
-    tiny = gain <= 1e-13 * at.cost  # below rounding of the cost: trust the model
-    ratio = (at.cost - trial.cost) / np.where(gain > 0, gain, np.inf)
+    tiny = (
+        predicted_decrease <= 1e-13 * iterates.cost
+    )  # below rounding of the cost: trust the model
+    ratio = (iterates.cost - trial.cost) / np.where(
+        predicted_decrease > 0, predicted_decrease, np.inf
+    )
     ratio = np.where(tiny | ~np.isfinite(ratio), 1.0, np.clip(ratio, 0.0, 1.0))
-    return (trial.cost < at.cost) | tiny, ratio
+    return (trial.cost < iterates.cost) | tiny, ratio
 
 
-def nielsen(damping: Array, growth: Array, accept: Array, ratio: Array) -> tuple[Array, Array]:
+def update_damping_by_nielsen(
+    damping: Array, growth: Array, is_accepted: Array, decrease_ratio: Array
+) -> tuple[Array, Array]:
     """The next damping and its next growth, (B,) each."""
-    shrink = np.maximum(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3)
-    next_damping = np.where(accept, damping * shrink, damping * growth)
-    return next_damping, np.where(accept, 2.0, growth * 2.0)
+    shrink = np.maximum(1.0 / 3.0, 1.0 - (2.0 * decrease_ratio - 1.0) ** 3)
+    next_damping = np.where(is_accepted, damping * shrink, damping * growth)
+    return next_damping, np.where(is_accepted, 2.0, growth * 2.0)
 
 
 @dataclass(frozen=True, eq=False)
-class Examined(Generic[X]):
+class LinearisedIterates(Generic[X]):
     """Iterates with what a step needs.
 
     cost: (B,).  gradient: (B, p), gram: (B, p, p) over all parameters.  target, matrix: right
@@ -226,67 +247,79 @@ class Examined(Generic[X]):
         """All but x, in the order of the fields."""
         return self.cost, self.gradient, self.gram, self.target, self.matrix, self.scale
 
-    def take(self, rows: Array) -> Examined[X]:
+    def take(self, member_indices: Array) -> LinearisedIterates[X]:
         """Some members of the batch."""
-        return Examined(self.x.take(rows), *(array[rows] for array in self.arrays))
+        return LinearisedIterates(
+            self.x.take(member_indices), *(array[member_indices] for array in self.arrays)
+        )
 
-    def put(self, rows: Array, other: Examined[X]) -> Examined[X]:
+    def put(self, member_indices: Array, other: LinearisedIterates[X]) -> LinearisedIterates[X]:
         """The batch with some members taken from another one of the same size."""
-        out = Examined(self.x.put(rows, other.x.take(rows)), *map(np.copy, self.arrays))
+        out = LinearisedIterates(
+            self.x.put(member_indices, other.x.take(member_indices)), *map(np.copy, self.arrays)
+        )
         for mine, new in zip(out.arrays, other.arrays, strict=True):
-            mine[rows] = new[rows]
+            mine[member_indices] = new[member_indices]
         return out
 
 
-def examine(problem: Separable[X], x: X, method: Method) -> Examined[X]:
+def linearise_iterates(
+    problem: SeparableProblem[X], x: X, method: LeastSquaresMethod
+) -> LinearisedIterates[X]:
     """Cost and (reduced) normal equations; separable methods move x to its best lengths first."""
     if not method.separable:
         cost, gradient, gram = problem.normal(x)
-        return Examined(x, cost, gradient, gram, gradient, gram, column_size(gram))
+        return LinearisedIterates(
+            x, cost, gradient, gram, gradient, gram, jacobian_column_norms(gram)
+        )
     x, cost, gradient, gram, coupled = problem.reduced(x, full=method.full)
     r, w = problem.linear, ~problem.linear
     lengths, mixed = gram[:, r][:, :, r], gram[:, r][:, :, w]
     # Golub and Pereyra: P J_w on top of (G+)' M; both halves need the inverse of the lengths' part
     both = np.concatenate([mixed, coupled], axis=-1)
-    solved = solve_normal(lengths, both)
+    solved = solve_normal_equations(lengths, both)
     angles = mixed.shape[-1]
     matrix = gram[:, w][:, :, w] - np.swapaxes(mixed, -1, -2) @ solved[..., :angles]
     matrix = matrix + np.swapaxes(coupled, -1, -2) @ solved[..., angles:]
-    size = np.maximum(column_size(matrix), 1e-5 * column_size(gram)[:, w])
+    size = np.maximum(jacobian_column_norms(matrix), 1e-5 * jacobian_column_norms(gram)[:, w])
     if method.damped:  # angles share a unit: the paper's mu I, in units of the largest column
         size = np.repeat(size.max(axis=1, keepdims=True), size.shape[1], axis=1)
-    return Examined(x, cost, gradient, gram, gradient[:, w], matrix, size)
+    return LinearisedIterates(x, cost, gradient, gram, gradient[:, w], matrix, size)
 
 
-def column_size(gram: Array) -> Array:
+def jacobian_column_norms(gram: Array) -> Array:
     """Norms of the Jacobian's columns: (B, p)."""
     return np.asarray(np.sqrt(np.maximum(np.einsum("bii->bi", gram), 1e-300)))
 
 
-def lift(linear: Array, short: Array, gradient: Array, gram: Array, method: Method) -> Array:
+def extend_step_to_all_parameters(
+    is_linear: Array, reduced_step: Array, gradient: Array, gram: Array, method: LeastSquaresMethod
+) -> Array:
     """A step in all parameters from one in the angles; the lengths follow to first order."""
     if not method.separable:
-        return short
+        return reduced_step
     out = np.zeros(gradient.shape)
-    out[:, ~linear] = short
-    mixed = gram[:, linear][:, :, ~linear]
-    pull = gradient[:, linear, None] - mixed @ short[..., None]
-    out[:, linear] = solve_normal(gram[:, linear][:, :, linear], pull)[..., 0]
+    out[:, ~is_linear] = reduced_step
+    mixed = gram[:, is_linear][:, :, ~is_linear]
+    pull = gradient[:, is_linear, None] - mixed @ reduced_step[..., None]
+    out[:, is_linear] = solve_normal_equations(gram[:, is_linear][:, :, is_linear], pull)[..., 0]
     return out
 
 
-def damped_step(at: Examined[X], damping: Array) -> tuple[Array, Array]:
+def solve_damped_step(iterates: LinearisedIterates[X], damping: Array) -> tuple[Array, Array]:
     """(H + mu D) step = slope with D = scale^2, and the predicted decrease of the cost."""
-    scaled = at.matrix / at.scale[:, :, None] / at.scale[:, None, :]
-    right = at.target / at.scale
+    scaled = iterates.matrix / iterates.scale[:, :, None] / iterates.scale[:, None, :]
+    right = iterates.target / iterates.scale
     eye = np.eye(right.shape[-1])
-    step = solve_normal(scaled + damping[:, None, None] * eye, right[..., None], rescale=False)
+    step = solve_normal_equations(
+        scaled + damping[:, None, None] * eye, right[..., None], rescale=False
+    )
     step = step[..., 0]
     model = 2.0 * right * step - step * (scaled @ step[..., None])[..., 0]
-    return step / at.scale, model.sum(-1)
+    return step / iterates.scale, model.sum(-1)
 
 
-def solve_normal(matrix: Array, right: Array, *, rescale: bool = True) -> Array:
+def solve_normal_equations(matrix: Array, right: Array, *, rescale: bool = True) -> Array:
     """Solve a batch of symmetric positive semi-definite systems; the least solution if singular.
 
     rescale: bring the diagonal to one first, which a matrix in bad units needs.

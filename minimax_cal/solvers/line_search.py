@@ -10,15 +10,15 @@ from collections.abc import Callable
 
 import numpy as np
 
-from minimax_cal.ground.arrays import Array
+from minimax_cal.core.arrays import Array
 from minimax_cal.solvers.bfgs import EPS
 from minimax_cal.solvers.epigraph_qp import SearchStep
 from minimax_cal.solvers.iterate import VALUE_ROUNDING, Iterate, X
 from minimax_cal.solvers.linearisation import Linearisation, constraint_excess
 
-MIN_DECREASE = 1e-4  # of what the linear model promises [Armijo]
+MIN_ARMIJO_DECREASE = 1e-4  # of what the linear model promises [Armijo]
 MIN_FALLING_SLOPE = 0.25  # at the end of a step, relative to its start: worth going on
-MAX_LENGTHENING = 1e15  # times a step
+MAX_STEP_LENGTHENING = 1e15  # times a step
 CorrectStep = Callable[[Array, Array], SearchStep]
 
 
@@ -30,7 +30,7 @@ def search_along_step(
     The full step is nearly always taken, so its derivatives are computed at once.
     correct_step: solves the QP again with other values f (k,) and c (l,).
     """
-    problem, x, here = iterate.problem, iterate.x, iterate.here
+    problem, x, here = iterate.problem, iterate.x, iterate.linearisation
 
     def merit(f: Array, c: Array) -> float:
         value = float(f.max())
@@ -48,7 +48,7 @@ def search_along_step(
     trial = problem.step(x, step.d)
     there = problem.linearise(trial)
     value = merit(there.f, there.c)
-    if value <= start - MIN_DECREASE * decrease + rounding:
+    if value <= start - MIN_ARMIJO_DECREASE * decrease + rounding:
         ahead = merit(there.f + there.jacobian @ step.d, there.c + there.normal @ step.d)
         length = 1.0
         if iterate.quasi_newton and value - ahead > MIN_FALLING_SLOPE * decrease > rounding:
@@ -67,7 +67,7 @@ def search_along_step(
         ):
             trial = problem.step(x, corrected.d)
             there = problem.linearise(trial)
-            if merit(there.f, there.c) <= start - MIN_DECREASE * decrease + rounding:
+            if merit(there.f, there.c) <= start - MIN_ARMIJO_DECREASE * decrease + rounding:
                 return 1.0, corrected.d, trial, there
 
     # Backtracking, to the minimum of the parabola through slope and value where there is one.
@@ -79,7 +79,7 @@ def search_along_step(
         move = length * step.d
         trial = problem.step(x, move)
         value = merit(*problem.evaluate(trial))
-        if value <= start - MIN_DECREASE * length * decrease + rounding:
+        if value <= start - MIN_ARMIJO_DECREASE * length * decrease + rounding:
             return length, move, trial, problem.linearise(trial)
     return 0.0, np.zeros_like(step.d), x, here
 
@@ -88,23 +88,24 @@ def lengthen_step(
     iterate: Iterate[X],
     d: Array,
     merit: Callable[[Array, Array], float],
-    start: float,
-    value: float,
+    start_merit: float,
+    step_merit: float,
 ) -> float:
     """How many times the step d (p,) to go, doubled while the merit falls well.
 
     Where an estimated Hessian is far too large, as after steps through functions that grow fast.
-    start, value: merits here and after d.  A step ends where a linearised constraint does.
+    start_merit, step_merit: merits here and after d.  A step ends where a linearised constraint
+    does.
     """
-    problem, here = iterate.problem, iterate.here
+    problem, here = iterate.problem, iterate.linearisation
     violation = constraint_excess(here.c, problem.lower, problem.upper)
     length = 1.0
-    while length < MAX_LENGTHENING:
+    while length < MAX_STEP_LENGTHENING:
         ends = here.c + 2.0 * length * (here.normal @ d)
         if np.any(constraint_excess(ends, problem.lower, problem.upper) > violation):
             break
         farther = merit(*problem.evaluate(problem.step(iterate.x, 2.0 * length * d)))
-        if not value - farther > min(0.1 * (start - value), 0.5 * abs(value)):
+        if not step_merit - farther > min(0.1 * (start_merit - step_merit), 0.5 * abs(step_merit)):
             break
-        length, value = 2.0 * length, farther
+        length, step_merit = 2.0 * length, farther
     return length

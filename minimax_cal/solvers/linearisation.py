@@ -11,10 +11,10 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
-from minimax_cal.ground.arrays import Array
+from minimax_cal.core.arrays import Array
 
 X = TypeVar("X")
-SUM_WEIGHT = 1e3  # of the row that holds the sum of the multipliers: kept to a millionth
+MULTIPLIER_SUM_WEIGHT = 1e3  # of the row that holds the sum of the multipliers: kept to a millionth
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,23 +77,28 @@ class Scaling:
 
     @staticmethod
     def from_lengths(
-        here: Linearisation, value: float, x: Array, lower: Array, upper: Array
+        linearisation: Linearisation, value: float, lengths: Array, lower: Array, upper: Array
     ) -> Scaling:
         """A constraint's is its way to a bound, at least how much it changes along a variable's."""
-        change = np.abs(here.normal * x).max(axis=1, initial=0.0)
-        return Scaling(value, x, find_constraint_units(here, change, lower, upper))
+        change = np.abs(linearisation.normal * lengths).max(axis=1, initial=0.0)
+        return Scaling(value, lengths, find_constraint_units(linearisation, change, lower, upper))
 
-    def apply(self, here: Linearisation) -> Linearisation:
+    def apply(self, linearisation: Linearisation) -> Linearisation:
         """A linearisation in these units."""
         return replace(
-            here, f=here.f / self.value, jacobian=here.jacobian * (self.x / self.value),
-            c=here.c / self.c, normal=here.normal * (self.x / self.c[:, None]),
-        )  # fmt: skip
+            linearisation,
+            f=linearisation.f / self.value,
+            jacobian=linearisation.jacobian * (self.x / self.value),
+            c=linearisation.c / self.c,
+            normal=linearisation.normal * (self.x / self.c[:, None]),
+        )
 
 
-def find_constraint_units(here: Linearisation, change: Array, lower: Array, upper: Array) -> Array:
+def find_constraint_units(
+    linearisation: Linearisation, change: Array, lower: Array, upper: Array
+) -> Array:
     """(l,) ways of constraints to their bounds, at least a change (l,) of theirs; 1 for none."""
-    way = np.minimum(np.abs(upper - here.c), np.abs(here.c - lower))
+    way = np.minimum(np.abs(upper - linearisation.c), np.abs(linearisation.c - lower))
     units = np.maximum(change, np.where(np.isfinite(way), way, 0.0))
     return np.where(units > 0.0, units, 1.0)
 
@@ -121,7 +126,7 @@ class Kkt:
 
 
 def measure_kkt(
-    here: Linearisation,
+    linearisation: Linearisation,
     mu: Array,
     lam: Array,
     lower: Array,
@@ -133,19 +138,23 @@ def measure_kkt(
 
     lengths: (p,) of the variables, for stationarity.  constraint_units: (l,), for violation.
     """
-    stationarity = (mu @ here.jacobian + lam @ here.normal) * lengths
-    complementarity = float(mu @ (here.f.max() - here.f))
+    stationarity = (mu @ linearisation.jacobian + lam @ linearisation.normal) * lengths
+    complementarity = float(mu @ (linearisation.f.max() - linearisation.f))
     if lam.any():
         held = np.flatnonzero(lam)  # elsewhere a bound may be infinitely far
-        room = np.where(lam > 0.0, upper - here.c, here.c - lower)[held]
+        room = np.where(lam > 0.0, upper - linearisation.c, linearisation.c - lower)[held]
         complementarity += float(np.abs(lam[held] * room).sum())
     violation = 0.0
     if len(lam):
-        violation = float((constraint_excess(here.c, lower, upper) / constraint_units).max())
+        violation = float(
+            (constraint_excess(linearisation.c, lower, upper) / constraint_units).max()
+        )
     return Kkt(float(np.abs(stationarity).max(initial=0.0)), complementarity, violation)
 
 
-def balance_multipliers(here: Linearisation, lower: Array, upper: Array) -> tuple[Array, Array]:
+def fit_multipliers_by_least_squares(
+    linearisation: Linearisation, lower: Array, upper: Array
+) -> tuple[Array, Array]:
     """mu and lam that make stationarity and complementarity at a point least, mu of sum one.
 
     Non-negative least squares, so that nothing of a QP solver is in them.
@@ -153,21 +162,27 @@ def balance_multipliers(here: Linearisation, lower: Array, upper: Array) -> tupl
     from scipy.optimize import nnls
 
     k, (above, below) = (
-        len(here.f),
+        len(linearisation.f),
         (np.flatnonzero(upper < np.inf), np.flatnonzero(lower > -np.inf)),
     )
-    columns = np.concatenate([here.jacobian, here.normal[above], -here.normal[below]]).T
+    columns = np.concatenate(
+        [linearisation.jacobian, linearisation.normal[above], -linearisation.normal[below]]
+    ).T
     if not np.all(np.isfinite(columns)):
-        return np.full(k, 1.0 / k), np.zeros(len(here.c))
-    rooms = (here.f.max() - here.f, (upper - here.c)[above], (here.c - lower)[below])
+        return np.full(k, 1.0 / k), np.zeros(len(linearisation.c))
+    rooms = (
+        linearisation.f.max() - linearisation.f,
+        (upper - linearisation.c)[above],
+        (linearisation.c - lower)[below],
+    )
     room = np.maximum(np.concatenate(rooms), 0.0)
-    sum_row = SUM_WEIGHT * (np.arange(len(room)) < k)
+    sum_row = MULTIPLIER_SUM_WEIGHT * (np.arange(len(room)) < k)
     found, _ = nnls(
         np.vstack([columns, np.diag(room), sum_row]),
-        np.append(np.zeros(len(columns) + len(room)), SUM_WEIGHT),
+        np.append(np.zeros(len(columns) + len(room)), MULTIPLIER_SUM_WEIGHT),
     )
     found = found / found[:k].sum()
-    lam = np.zeros(len(here.c))
+    lam = np.zeros(len(linearisation.c))
     lam[above] += found[k : k + len(above)]
     lam[below] -= found[k + len(above) :]
     return found[:k], lam

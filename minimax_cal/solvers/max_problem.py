@@ -7,19 +7,25 @@ from typing import Any
 
 import numpy as np
 
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import OptionError
+from minimax_cal.core.arrays import Array
+from minimax_cal.core.errors import OptionError
 from minimax_cal.solvers.constraint_rows import ConstraintRows
-from minimax_cal.solvers.derivatives import CountedFunction, CountedJacobian, measure_lengths
+from minimax_cal.solvers.derivatives import (
+    CountedFunction,
+    CountedJacobian,
+    measure_variable_lengths,
+)
 from minimax_cal.solvers.linearisation import Linearisation, constraint_excess
 
-ROW_ROUNDING = 1e-6  # of what a row's variables could reach: so much of its size is always there
-MAX_CANCELLING = 1e2  # times the sum of terms: so much of terms that cancel counts
+ROW_SIZE_SHARE_OF_REACH = (
+    1e-6  # of what a row's variables could reach: so much of its size is always there
+)
+MAX_CANCELLING_TERMS_RATIO = 1e2  # times the sum of terms: so much of terms that cancel counts
 EPS = float(np.finfo(float).eps)
 SMALLEST_NORMAL = float(np.finfo(float).tiny)
 
 
-def no_curvature(weights: Array) -> Array:
+def empty_curvature(weights: Array) -> Array:
     """The curvature of functions that only BFGS can estimate: an empty matrix."""
     return np.zeros((0, 0))
 
@@ -45,7 +51,7 @@ class MaxOfFunctions:
     first_lengths: Array
 
     @staticmethod
-    def describe(
+    def from_functions(
         x: Array, function: CountedFunction, scheme: Any, bounds: Any, constraints: Any
     ) -> MaxOfFunctions:
         """The problem as it is at x.  Raises OptionError where values or gradients do not fit."""
@@ -59,7 +65,9 @@ class MaxOfFunctions:
         if not len(values):
             raise OptionError("minimize_max: fun(x0) is empty; give at least one function")
         level = float(np.abs(values).max()) or 1.0
-        lengths = measure_lengths(function, x, low, high, level, np.where(x, np.abs(x), 1.0))
+        lengths = measure_variable_lengths(
+            function, x, low, high, level, np.where(x, np.abs(x), 1.0)
+        )
         jacobian = CountedJacobian(function, scheme, lengths)
         slopes = jacobian(x)
         if slopes.shape != (len(values), len(x)):
@@ -77,7 +85,9 @@ class MaxOfFunctions:
         values = self.function(x)
         level = float(abs(values.max())) or float(np.abs(values).max())
         level = max(level or float(np.ldexp(1.0, self.exponent)), SMALLEST_NORMAL)
-        lengths = measure_lengths(self.function, x, self.low, self.high, level, self.lengths)
+        lengths = measure_variable_lengths(
+            self.function, x, self.low, self.high, level, self.lengths
+        )
         self.jacobian.lengths = lengths
         for _, jacobian in self.rows.parts:
             jacobian.lengths = lengths
@@ -107,13 +117,13 @@ class MaxOfFunctions:
         """f, c and their derivatives; the curvature is left to BFGS."""
         f, c = self.evaluate(x)
         slopes = np.ldexp(self.jacobian(x), -self.exponent)
-        return Linearisation(f, slopes, c, self.rows.jacobian(x), no_curvature)
+        return Linearisation(f, slopes, c, self.rows.jacobian(x), empty_curvature)
 
-    def linearise_best(self, x: Array) -> Linearisation:
+    def linearise_with_best_accuracy(self, x: Array) -> Linearisation:
         """The same with central differences in place of forward ones."""
-        slopes = np.ldexp(self.jacobian.best(x), -self.exponent)
+        slopes = np.ldexp(self.jacobian.best_accuracy_jacobian(x), -self.exponent)
         f, c = self.evaluate(x)
-        return Linearisation(f, slopes, c, self.rows.best_jacobian(x), no_curvature)
+        return Linearisation(f, slopes, c, self.rows.best_jacobian(x), empty_curvature)
 
     def step(self, x: Array, d: Array) -> Array:
         """The point moved."""
@@ -131,6 +141,8 @@ class MaxOfFunctions:
         reach = np.abs(normal) @ np.minimum(self.lengths, self.first_lengths)
         reach = np.where(end == 0.0, np.abs(normal) @ np.maximum(self.lengths, np.abs(x)), reach)
         left = np.maximum(np.abs(end), np.abs(c))
-        size = np.maximum(left, np.minimum(np.abs(normal) @ np.abs(x), MAX_CANCELLING * left))
-        size = size + np.where(end == 0.0, 1.0, ROW_ROUNDING) * reach
+        size = np.maximum(
+            left, np.minimum(np.abs(normal) @ np.abs(x), MAX_CANCELLING_TERMS_RATIO * left)
+        )
+        size = size + np.where(end == 0.0, 1.0, ROW_SIZE_SHARE_OF_REACH) * reach
         return constraint_excess(c, self.lower, self.upper) / np.where(size > 0.0, size, 1.0)

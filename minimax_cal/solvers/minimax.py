@@ -17,7 +17,7 @@ from typing import Generic
 
 import numpy as np
 
-from minimax_cal.ground.arrays import Array
+from minimax_cal.core.arrays import Array
 from minimax_cal.solvers.epigraph_qp import (
     CountingQpSolver,
     VerifiedQpSolver,
@@ -30,8 +30,8 @@ from minimax_cal.solvers.linearisation import Kkt, MinimaxProblem
 from minimax_cal.solvers.status import Status
 from qp_backends import ProblemError
 
-HESSIANS = ("gauss-newton", "bfgs")
-NUMBER = re.compile(r"\d[\d.]*(e[+-]?\d+)?")
+HESSIAN_CHOICES = ("gauss-newton", "bfgs")
+NUMBER_PATTERN = re.compile(r"\d[\d.]*(e[+-]?\d+)?")
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def solve(
     report: is called with each step.  mu: (k,) multipliers of a similar problem, to begin with.
     scales: of variables and value, where they are known; else the derivatives at x give them.
     """
-    iterate = Iterate.start(problem, x, settings.hessian, mu, scales)
+    iterate = Iterate.start_at(problem, x, settings.hessian, mu, scales)
     solve_qp, tolerance = CountingQpSolver(qp), settings.tolerance
     status: Status | None = None
     trace: list[Step] = []
@@ -123,13 +123,13 @@ def solve(
             break
         notes += step.notes
         if not step.usable:
-            balanced = iterate.with_balanced_multipliers()
+            balanced = iterate.with_fitted_multipliers()
             is_optimal = balanced.is_nearly_optimal(tolerance)  # all the same
             iterate = balanced if is_optimal else iterate
             status = Status.CONVERGED if is_optimal else Status.FAILED
             break
         if not step.exact:
-            balanced = iterate.with_balanced_multipliers()
+            balanced = iterate.with_fitted_multipliers()
             step = replace(step, mu=balanced.mu, lam=balanced.lam)
 
         # Penalties of violations, at least as large as the multipliers.
@@ -142,21 +142,21 @@ def solve(
             break
 
         # A step that lowers the merit function, or more damping where there is none.
-        length, d, end, there = 0.0, np.zeros_like(step.d), iterate.x, iterate.here
+        length, d, end, there = 0.0, np.zeros_like(step.d), iterate.x, iterate.linearisation
         if iterate.kkt.residual > tolerance:
             correct_step = partial(solve_subproblem, iterate, hessian, solve_qp)
             length, d, end, there = search_along_step(iterate, step, correct_step)
-        value, kkt = float(iterate.here.f.max()), iterate.kkt
+        value, kkt = float(iterate.linearisation.f.max()), iterate.kkt
         trace.append(Step(iteration, value, kkt.violation, kkt.residual, length, step.backend))
         report(trace[-1])
-        status = iterate.status_in_place(tolerance, step.exact)
+        status = iterate.status_before_step(tolerance, step.exact)
         if status is None:
-            iterate = iterate.move(d, end, there) if length else iterate.damp()
+            iterate = iterate.move_to(d, end, there) if length else iterate.with_more_damping()
             status = iterate.status_after_step(tolerance, step.exact)
 
         # Where nothing moves any more, the multipliers of the QP may be to blame.
         if status is Status.STALLED or (status is None and not length):
-            balanced = iterate.with_balanced_multipliers()
+            balanced = iterate.with_fitted_multipliers()
             if balanced.is_nearly_optimal(tolerance):
                 iterate, status = balanced, Status.CONVERGED
         if status is not None:
@@ -165,17 +165,27 @@ def solve(
         percent = 100.0 * iterate.relative_decrease_bound()
         notes.append(f"to first order the largest function may still fall by {percent:.2g} %")
     return Optimum(
-        iterate.x, iterate.here.f, iterate.here.c, iterate.mu, iterate.lam, iterate.kkt,
-        len(trace), status or Status.ITERATION_LIMIT, tuple(trace), merge_notes(notes),
-        dict(solve_qp.answered), solve_qp.warm, solve_qp.residual,
-    )  # fmt: skip
+        iterate.x,
+        iterate.linearisation.f,
+        iterate.linearisation.c,
+        iterate.mu,
+        iterate.lam,
+        iterate.kkt,
+        len(trace),
+        status or Status.ITERATION_LIMIT,
+        tuple(trace),
+        merge_similar_notes(notes),
+        dict(solve_qp.answered),
+        solve_qp.warm,
+        solve_qp.residual,
+    )
 
 
-def merge_notes(notes: Sequence[str]) -> tuple[str, ...]:
+def merge_similar_notes(notes: Sequence[str]) -> tuple[str, ...]:
     """Notes; of those that differ in nothing but numbers the first, with their count."""
     alike: dict[str, list[str]] = {}
     for note in notes:
-        alike.setdefault(NUMBER.sub("#", note), []).append(note)
+        alike.setdefault(NUMBER_PATTERN.sub("#", note), []).append(note)
     return tuple(
         same[0] if len(same) == 1 else f"{same[0]} (the first of {len(same)} alike)"
         for same in alike.values()

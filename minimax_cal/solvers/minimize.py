@@ -10,24 +10,24 @@ from typing import Any, Literal
 import numpy as np
 from scipy.optimize import Bounds, LinearConstraint, NonlinearConstraint, OptimizeResult
 
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import OptionError
+from minimax_cal.core.arrays import Array
+from minimax_cal.core.errors import OptionError
 from minimax_cal.solvers import minimax
 from minimax_cal.solvers.answer_check import (
     AnswerCheck,
-    check_answer,
     falls_without_end,
     find_descent_from_stationary_point,
+    measure_answer_optimality,
 )
-from minimax_cal.solvers.constraint_rows import read_bounds, split_values_and_jacobian
-from minimax_cal.solvers.derivatives import CountedFunction, find_wrong_function
+from minimax_cal.solvers.constraint_rows import parse_bounds, split_values_and_jacobian
+from minimax_cal.solvers.derivatives import CountedFunction, find_function_with_wrong_gradient
 from minimax_cal.solvers.epigraph_qp import VerifiedQpSolver
 from minimax_cal.solvers.feasibility import find_feasible_point
 from minimax_cal.solvers.iterate import NO_MULTIPLIERS, StartScales
 from minimax_cal.solvers.linearisation import constraint_excess
 from minimax_cal.solvers.max_problem import EPS, MaxOfFunctions
 from minimax_cal.solvers.minimax import Optimum, Sqp, Step
-from minimax_cal.solvers.own_qp import QpFunction, adapt_qp_function
+from minimax_cal.solvers.qp_function import QpFunction, adapt_qp_function
 from minimax_cal.solvers.status import Status
 from qp_backends import solve as solve_qp
 from qp_backends.registry import BackendName
@@ -37,10 +37,12 @@ ConstraintLike = Constraint | Mapping[str, Any]  # or as `scipy.optimize.minimiz
 Scheme = Literal["2-point", "3-point", "cs"]
 
 QP_TOLERANCE = 1e-9
-MAX_ESCAPES = 3  # from points where every gradient vanishes but better ones are near
-MIN_PROGRESS = 1e-3  # of the tolerance: a search that gains less ends
-UNBOUNDED = "unbounded"
-MESSAGES = {
+MAX_STATIONARY_POINT_ESCAPES = (
+    3  # from points where every gradient vanishes but better ones are near
+)
+MIN_PROGRESS_PER_TOLERANCE = 1e-3  # of the tolerance: a search that gains less ends
+UNBOUNDED_STATUS = "unbounded"
+STATUS_MESSAGES = {
     "converged": "optimal to the tolerance",
     "iteration_limit": "the iteration limit was reached; raise maxiter, or give an exact jac",
     "stalled": "no step lowers the largest function any more, yet the optimality test fails; give "
@@ -48,7 +50,7 @@ MESSAGES = {
     "infeasible": "the constraints could not be met and may contradict each other; loosen them",
     "failed": "fun or jac gave no finite numbers, or the QP backend no answer; try another x0, or "
     "another qp",
-    UNBOUNDED: "the largest function falls without end; add bounds or constraints",
+    UNBOUNDED_STATUS: "the largest function falls without end; add bounds or constraints",
     "wrong_gradient": "jac is not the derivative of fun (function {}); mend it, or leave it out",
 }
 
@@ -137,13 +139,13 @@ def minimize_max(
     if jac is True:
         fun, jac = split_values_and_jacobian(fun)
     scheme: Any = (lambda z: jac(z, *args)) if callable(jac) else jac or "2-point"
-    box = read_bounds(bounds, len(x))
+    box = parse_bounds(bounds, len(x))
     alone = isinstance(constraints, Constraint | Mapping)
     rows: Any = [constraints] if alone else constraints
     if box is not None:
         x = np.clip(x, box.lb, box.ub)
     function = CountedFunction(lambda z: fun(z, *args))
-    problem = MaxOfFunctions.describe(x, function, scheme, box, rows)
+    problem = MaxOfFunctions.from_functions(x, function, scheme, box, rows)
     solver: VerifiedQpSolver = (
         partial(solve_qp, name=qp, tolerance=QP_TOLERANCE)
         if isinstance(qp, str)
@@ -153,23 +155,23 @@ def minimize_max(
     if is_exact and (wrong := find_wrong_gradient(problem, x)) is not None:
         return report_wrong_gradient(problem, x, wrong)
 
-    search = Search(solver, tol, maxiter, callback)
+    search = OptimumSearch(solver, tol, maxiter, callback)
     answer = search.find_optimum(problem, x)
     problem, optimum = answer.problem, answer.optimum
     status = str(answer.status)
     if (
-        status != UNBOUNDED
+        status != UNBOUNDED_STATUS
         and is_exact
         and (wrong := find_wrong_gradient(problem, optimum.x)) is not None
     ):
         return report_wrong_gradient(problem, optimum.x, wrong)
     values = problem.function(optimum.x)
     violation = constraint_excess(optimum.c, problem.lower, problem.upper).max(initial=0.0)
-    message = MESSAGES[status]
+    message = STATUS_MESSAGES[status]
     rounding = EPS * float(np.abs(values).max())
     if status == Status.CONVERGED and rounding > tol * search.gained:
         message += f"; values near {np.abs(values).max():.3g} are rounded to {rounding:.1g}"
-    return build_result(
+    return build_optimize_result(
         x=optimum.x, fun=float(values.max()), values=values, success=status == Status.CONVERGED,
         status=status, message=message, nit=search.iteration_count,
         nfev=function.count, njev=problem.jacobian.count, multipliers=answer.check.mu,
@@ -190,7 +192,7 @@ class SearchAnswer:
 
 
 @dataclass
-class Search:
+class OptimumSearch:
     """Runs of the SQP, each from where the last one ended and in the units of that point.
 
     A run measures tolerance, reach and zero from where it began; far from the start they mean
@@ -224,7 +226,9 @@ class Search:
             problem = problem.rescale(x)
             lam = np.ldexp(optimum.lam, last_exponent - problem.exponent)
             optimum = replace(optimum, f=problem.values(x), lam=lam)
-            check = check_answer(problem, x, optimum.mu, optimum.lam, start, self.tolerance)
+            check = measure_answer_optimality(
+                problem, x, optimum.mu, optimum.lam, start, self.tolerance
+            )
             value = float(np.ldexp(optimum.f.max(), problem.exponent))
             violation = check.kkt.violation
             self.gained = start_value - value
@@ -232,7 +236,7 @@ class Search:
 
             if check.kkt.residual <= self.tolerance:
                 lower = find_descent_from_stationary_point(problem, x)
-                if lower is None or escape_count == MAX_ESCAPES:
+                if lower is None or escape_count == MAX_STATIONARY_POINT_ESCAPES:
                     return answer
                 x, mu, escape_count = lower, NO_MULTIPLIERS, escape_count + 1
                 continue
@@ -240,7 +244,7 @@ class Search:
             if (has_ended or optimum.status is Status.FAILED) and (
                 self.falls_without_end(described, start, x)
             ):
-                return replace(answer, status=UNBOUNDED)
+                return replace(answer, status=UNBOUNDED_STATUS)
             if has_ended:
                 return replace(answer, status=Status.ITERATION_LIMIT)
 
@@ -258,7 +262,7 @@ class Search:
 
             # From here again, as long as that gains anything.
             gain = (last_value - value) / np.ldexp(check.level, problem.exponent)
-            has_gained = gain > MIN_PROGRESS * self.tolerance and violation <= max(
+            has_gained = gain > MIN_PROGRESS_PER_TOLERANCE * self.tolerance and violation <= max(
                 last_violation, self.tolerance
             )
             is_nearer = self.tolerance < violation < 0.9 * last_violation
@@ -271,7 +275,7 @@ class Search:
                 problem.jacobian.scheme = "3-point"
                 continue
             if self.falls_without_end(described, start, x):
-                return replace(answer, status=UNBOUNDED)
+                return replace(answer, status=UNBOUNDED_STATUS)
             ended = optimum.status
             return replace(answer, status=Status.STALLED if ended is Status.CONVERGED else ended)
 
@@ -299,10 +303,14 @@ class Search:
             self.iteration_count = before + step.iteration
             value = float(np.ldexp(step.value, problem.exponent))
             self.history.append(
-                build_result(value=value, violation=step.violation, kkt=step.kkt, step=step.length)
+                build_optimize_result(
+                    value=value, violation=step.violation, kkt=step.kkt, step=step.length
+                )
             )
             if self.callback is not None:
-                self.callback(build_result(fun=value, nit=self.iteration_count, kkt=step.kkt))
+                self.callback(
+                    build_optimize_result(fun=value, nit=self.iteration_count, kkt=step.kkt)
+                )
 
         settings = Sqp(self.tolerance, self.max_iterations - before, hessian="bfgs")
         scales = StartScales(problem.lengths, largest_level)
@@ -318,7 +326,7 @@ def largest_violation(problem: MaxOfFunctions, x: Array) -> float:
 
 def find_wrong_gradient(problem: MaxOfFunctions, x: Array) -> int | None:
     """Index of a function whose given gradient is not its derivative near x."""
-    return find_wrong_function(
+    return find_function_with_wrong_gradient(
         problem.values, lambda z: problem.linearise(z).jacobian, x, problem.low, problem.high,
         problem.lengths,
     )  # fmt: skip
@@ -328,16 +336,16 @@ def report_wrong_gradient(problem: MaxOfFunctions, x: Array, index: int) -> Opti
     """The result where a gradient is wrong: no answer, and where it was found out."""
     values = problem.function(x)
     status = "wrong_gradient"
-    return build_result(
+    return build_optimize_result(
         x=x, fun=float(values.max()), values=values, success=False, status=status,
-        message=MESSAGES[status].format(index), nit=0, nfev=problem.function.count,
+        message=STATUS_MESSAGES[status].format(index), nit=0, nfev=problem.function.count,
         njev=problem.jacobian.count, multipliers=np.full(len(values), 1.0 / len(values)),
         constraint_multipliers=np.zeros(len(problem.lower)), kkt=np.inf, violation=0.0, notes=(),
         history=(),
     )  # fmt: skip
 
 
-def build_result(**fields: Any) -> OptimizeResult:
+def build_optimize_result(**fields: Any) -> OptimizeResult:
     """A result in SciPy's form."""
     out = OptimizeResult()
     out.update(fields)

@@ -20,7 +20,7 @@ class Status(StrEnum):
     @property
     def advice(self) -> str:
         """What to try next."""
-        return ADVICE[self]
+        return STATUS_ADVICE[self]
 
     @property
     def keeps_drawn(self) -> bool:
@@ -28,7 +28,7 @@ class Status(StrEnum):
         return self in (Status.CONTRADICTORY, Status.NOT_DETERMINED, Status.NO_BETTER)
 
 
-ADVICE = {
+STATUS_ADVICE = {
     Status.CONVERGED: "",
     Status.ITERATION_LIMIT: "the iteration limit was reached: the robot file may not describe this "
     "arm (check lengths, joint signs, units), or some parameters are weakly determined",

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import minimax_cal as mc
-from minimax_cal.diagnosing.result import VERDICTS, load_diagnosis
+from minimax_cal.diagnosing.diagnosis import VERDICTS, load_diagnosis
 from minimax_cal.modelling.effects.table import EFFECTS
 from minimax_cal.modelling.simulate import Truth, simulate
-from minimax_cal.reporting import tables
+from minimax_cal.reporting import diagnosis_tables
 
 
 @pytest.fixture(scope="session")
@@ -187,20 +187,20 @@ def test_tables_of_where_show_dashes_for_what_cannot_be_told():
         "by_order": {"clock": {"place": "base", "follows": "time", "share": 0.5, "p": 0.3},
                      "temperature": None},
     }  # fmt: skip
-    target, joint, trend = tables.where_tables(where)
-    assert target.cells() == [["smr1", "4", "0.5000", "1.0000", "-", "", "-", "-"]]
-    assert joint.cells() == [["J1", "mrad", "0.2500", "its load", "50", "< 0.005"],
+    target, joint, trend = diagnosis_tables.build_error_location_tables(where)
+    assert target.formatted_cells() == [["smr1", "4", "0.5000", "1.0000", "-", "", "-", "-"]]
+    assert joint.formatted_cells() == [["J1", "mrad", "0.2500", "its load", "50", "< 0.005"],
                              ["J2", "mm", "0.7500", "", "-", "-"]]  # fmt: skip
-    assert trend.cells() == [["visit order", "base", "time", "50", "0.3"]]
+    assert trend.formatted_cells() == [["visit order", "base", "time", "50", "0.3"]]
 
 
 def test_what_cannot_be_tested_and_what_to_measure_next(folder):
     from dataclasses import replace
 
-    from minimax_cal.diagnosing.result import Alternative
+    from minimax_cal.diagnosing.diagnosis import AlternativeEffect
 
     found = mc.diagnose("ur10", folder / "gap.csv", quick=True)
-    other = Alternative("base_flex", "frame", 0.9, 3.0, 1.0, "ten poses stretched out")
+    other = AlternativeEffect("base_flex", "frame", 0.9, 3.0, 1.0, "ten poses stretched out")
     first = replace(found.effects[0], alternatives=(other,))
     more = replace(found, effects=(first,), not_testable=(("settling", "the visit order"),))
     *_, further, needs = more.tables()

@@ -13,8 +13,8 @@ from conftest import run
 from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.words import capitalise
+from minimax_cal.core.arrays import Array
+from minimax_cal.core.display_text import capitalise_sentence
 
 
 def write_apart(folder: Path, q: Array, points: Array, names: Array, order: Array) -> None:
@@ -86,7 +86,7 @@ def test_a_stale_reading_of_a_campaign_is_in_its_own_file(tmp_path, says, monkey
     ],
 )
 def test_a_path_or_name_keeps_its_letters(text, said):
-    assert capitalise(text) == said
+    assert capitalise_sentence(text) == said
 
 
 def test_nothing_but_its_mend_follows_a_failure(tmp_path, says):

@@ -13,11 +13,11 @@ from numpy.testing import assert_allclose
 import minimax_cal as mc
 from minimax_cal.cli.iso9283 import iso9283_command
 from minimax_cal.cli.map import map_command
-from minimax_cal.evidence.noise import Noise
 from minimax_cal.fitting.uncertainty import Uncertainty
-from minimax_cal.judging.saved import open_saved
-from minimax_cal.modelling.parameters import Names
+from minimax_cal.modelling.parameters import ParameterNames
 from minimax_cal.modelling.simulate import Simulation
+from minimax_cal.selection.noise_model import Noise
+from minimax_cal.validation.evaluation import open_saved_result
 
 FAST = ("--samples", 2000, "--bins", 16)
 
@@ -195,7 +195,7 @@ def test_effects_are_part_of_what_is_commanded(folder, poses, robot):
     fitted = mc.calibrate(robot, poses, "sum", effects=["joint_compliance:all"])
     path = folder / "effects.json"
     fitted.save(path)
-    saved = open_saved(path)
+    saved = open_saved_result(path)
     assert_allclose(
         saved.cells["after"].error(saved.data), fitted.cell.error(fitted.data), rtol=0, atol=1e-9
     )
@@ -246,8 +246,8 @@ def test_map_draws_and_tells(fit, tmp_path):
 
 def test_map_predicts_by_the_covariance_in_the_file(fit, folder, robot, poses):
     found = mc.calibrate(robot, poses)
-    names = Names(6, found.cell.target_names)
-    units = tuple("m" if length else "rad" for length in names.linear)
+    names = ParameterNames(6, found.cell.target_names)
+    units = tuple("m" if length else "rad" for length in names.linear_mask)
     even = 0.5 * (found.covariance + found.covariance.T)
     known = Uncertainty(names, units, even, lambda: Noise(0.0, 1e-10, 0.0), 100.0, "noise")
     file = without(fit, folder, covariance=known.to_dict())

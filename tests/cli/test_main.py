@@ -18,8 +18,8 @@ from numpy.testing import assert_allclose
 
 import minimax_cal as mc
 from minimax_cal.cli import progress
-from minimax_cal.cli.progress import Stages, Ticker, stages
-from minimax_cal.ground.stages import Stage, clock, count_stage
+from minimax_cal.cli.progress import ProgressTicker, StageClock, show_stage_progress
+from minimax_cal.core.progress_stages import ProgressStage, build_counted_stage, format_duration
 from minimax_cal.modelling.simulate import Simulation, Truth, simulate
 from minimax_cal.robots.robot import robot_from_dict
 
@@ -145,10 +145,10 @@ def test_wrong_input_is_one_line_and_exit_2(arguments, say, csv, tmp_path, refus
 
 
 def test_numbers_that_do_not_work_out_are_exit_1(csv, says, monkeypatch):
-    from minimax_cal.fitting import solve
+    from minimax_cal.fitting import cell_fit
     from minimax_cal.solvers.minimax import Sqp
 
-    monkeypatch.setattr(solve, "Sqp", lambda hessian: Sqp(iterations=1, hessian=hessian))
+    monkeypatch.setattr(cell_fit, "Sqp", lambda hessian: Sqp(iterations=1, hessian=hessian))
     assert "iteration limit" in says("calibrate irb2600", csv, code=1).err
 
 
@@ -316,48 +316,50 @@ class Hands:
 
 def test_time_left_is_that_of_the_steps_so_far():
     now = Hands()
-    told = Stages(now)
+    told = StageClock(now)
 
-    def replicate(part: int) -> Stage:
-        return count_stage("replicate", part, 10)
+    def replicate(part: int) -> ProgressStage:
+        return build_counted_stage("replicate", part, 10)
 
-    assert told.line("geometry") == "geometry, 0 s"
+    assert told.format_stage("geometry") == "geometry, 0 s"
     now.at += 60.0
-    assert told.line(replicate(1)) == "replicate 1 of 10, 1 min 0 s"
+    assert told.format_stage(replicate(1)) == "replicate 1 of 10, 1 min 0 s"
     now.at += 4.0  # two steps took four seconds, eight are left
-    assert told.line(replicate(3)) == "replicate 3 of 10, 1 min 4 s, about 16 s left"
+    assert told.format_stage(replicate(3)) == "replicate 3 of 10, 1 min 4 s, about 16 s left"
     now.at += 10.0
-    first = count_stage("part", 1, 3, " left out: joint 2")
-    assert told.line(first) == "part 1 of 3 left out: joint 2, 1 min 14 s"
-    assert told.line("step 3 of 9") == "step 3 of 9, 1 min 14 s"  # words are never read back
-    assert clock(125.4) == "2 min 5 s"
+    first = build_counted_stage("part", 1, 3, " left out: joint 2")
+    assert told.format_stage(first) == "part 1 of 3 left out: joint 2, 1 min 14 s"
+    assert (
+        told.format_stage("step 3 of 9") == "step 3 of 9, 1 min 14 s"
+    )  # words are never read back
+    assert format_duration(125.4) == "2 min 5 s"
 
 
 def test_a_line_every_ten_seconds_from_the_first_second(monkeypatch, capsys):
     now, waits = Hands(), list[float]()
-    ticker = Ticker(Stages(now))
+    ticker = ProgressTicker(StageClock(now))
 
     def wait(seconds: float) -> bool:
         """As an event that is set after three lines; stages begin meanwhile."""
         waits.append(seconds)
         now.at += seconds
         if len(waits) == 2:
-            ticker.show(count_stage("part", 3, 18))
+            ticker.start_stage(build_counted_stage("part", 3, 18))
         return len(waits) > 3
 
-    monkeypatch.setattr(progress, "FIRST", 1.0)  # as it is but for tests
-    ticker.show("geometry")
+    monkeypatch.setattr(progress, "SECONDS_TO_FIRST_PROGRESS_LINE", 1.0)  # as it is but for tests
+    ticker.start_stage("geometry")
     monkeypatch.setattr(ticker.over, "wait", wait)
-    ticker.run()
-    assert waits == [progress.FIRST, 10.0, 10.0, 10.0]
+    ticker.print_lines_until_over()
+    assert waits == [progress.SECONDS_TO_FIRST_PROGRESS_LINE, 10.0, 10.0, 10.0]
     assert capsys.readouterr().err.splitlines() == [
         "progress: geometry, 1 s",
         "progress: part 3 of 18, 11 s",
         "progress: part 3 of 18, 21 s, about 1 min 20 s left",
     ]
-    with stages(quiet=True) as show:
+    with show_stage_progress(is_quiet=True) as show:
         show("start")
-    with stages(quiet=False) as show:  # over before the first second
+    with show_stage_progress(is_quiet=False) as show:  # over before the first second
         show("start")
     assert capsys.readouterr().err == ""
 
@@ -536,7 +538,7 @@ def test_ctrl_c_during_imports_is_one_line(monkeypatch, capsys):
         def __getattr__(self, name: str) -> None:
             raise KeyboardInterrupt
 
-    name = "minimax_cal.cli.running"
+    name = "minimax_cal.cli.command_runner"
     monkeypatch.setitem(sys.modules, name, Interrupted(name))
     assert run("robots") == 130
     assert capsys.readouterr().err == "error: interrupted\n"

@@ -10,12 +10,18 @@ import pytest
 from conftest import run
 
 import minimax_cal as mc
-from experiments.pixel_cells import Cell, arm_error, board_points, make_cell, write_cell
-from experiments.relative import SIMULATORS, Arm
+from experiments.pixel_cells import (
+    PixelCell,
+    board_corner_points,
+    rms_arm_error_mm,
+    simulate_pixel_cell,
+    write_cell_files,
+)
+from experiments.relative import MEASUREMENT_SIMULATORS, ImperfectArm
 from minimax_cal.instruments import write_relative
-from minimax_cal.judging.saved import evaluate
+from minimax_cal.robots.joint_sampling import random_joint_values_above_floor
 from minimax_cal.robots.robot import robot_from_dict
-from minimax_cal.robots.sampling import random_poses
+from minimax_cal.validation.evaluation import evaluate
 
 # ---- one verb ------------------------------------------------------------------------------------
 
@@ -25,16 +31,16 @@ KINDS = {"wires_3": "distances", "closures_known": "closures", "poses": "poses"}
 
 def written(folder: Path, compliance: float) -> dict[str, Path]:
     """A file of each kind, and the known distance of the closures as an option says it."""
-    arm, rng = Arm.of("irb2600", 1, compliance), np.random.default_rng(3)
+    arm, rng = ImperfectArm.draw("irb2600", 1, compliance), np.random.default_rng(3)
     out = {}
     for kind in KINDS:
-        seen = SIMULATORS[kind](arm, np.random.default_rng(2), 80, 15e-6)
+        seen = MEASUREMENT_SIMULATORS[kind](arm, np.random.default_rng(2), 80, 15e-6)
         out[kind] = folder / f"{kind}.csv"
         write_relative(out[kind], seen.data)
         for first, second, length in seen.known:
             out["known"] = Path(f"{first},{second},{1e3 * length:.4f}")
-    q = random_poses(arm.robot, 80, rng)
-    y = arm.place(q) + 15e-6 * rng.normal(size=(80, 3))
+    q = random_joint_values_above_floor(arm.robot, 80, rng)
+    y = arm.target_positions(q) + 15e-6 * rng.normal(size=(80, 3))
     for name, unit in (("tracker", 1.0), ("tracker_m", 1e-3)):
         out[name] = folder / f"{name}.csv"
         mc.write_measurements(out[name], mc.measurements(q, unit * y))
@@ -284,14 +290,16 @@ def test_a_diagnosis_of_two_files_is_reported(stiff_files, tmp_path, says):
 
 
 @pytest.fixture(scope="module")
-def cell() -> Cell:
-    return make_cell(np.random.default_rng(2), points=board_points((6, 5), 0.04), poses=30)
+def cell() -> PixelCell:
+    return simulate_pixel_cell(
+        np.random.default_rng(2), target_points=board_corner_points((6, 5), 0.04), pose_count=30
+    )
 
 
 @pytest.fixture(scope="module")
-def cell_files(cell: Cell, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+def cell_files(cell: PixelCell, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     """The options that read a cell."""
-    return write_cell(cell, tmp_path_factory.mktemp("cell"))
+    return write_cell_files(cell, tmp_path_factory.mktemp("cell"))
 
 
 def test_pixels_to_urdf(cell, cell_files, tmp_path, answered):
@@ -308,9 +316,9 @@ def test_pixels_to_urdf(cell, cell_files, tmp_path, answered):
     assert {"name", "value", "nominal", "sigma", "unit"} <= set(content["parameters"][0])
     assert "camera_cam0_fx" in {p["name"] for p in content["parameters"]}
     arm = mc.load_robot(result)
-    assert arm_error(cell, arm) < 0.03
+    assert rms_arm_error_mm(cell, arm) < 0.03
     assert run("export", result, "--to", "urdf", "-o", tmp_path / "arm.urdf") == 0
-    assert arm_error(cell, mc.load_robot(tmp_path / "arm.urdf")) < 0.03
+    assert rms_arm_error_mm(cell, mc.load_robot(tmp_path / "arm.urdf")) < 0.03
     assert run("report", result, "-o", tmp_path / "report.html") == 0
     assert "Pixels: RMS error" in (tmp_path / "report.html").read_text()
     made = mc.simulate(cell.true, 30, 3, seed=1)
@@ -355,7 +363,7 @@ def test_the_drawn_arm_is_kept_where_it_is_known_better(cell, cell_files, tmp_pa
     refuses("--keep-anyway", "export", result, "--to", "urdf", "-o", tmp_path / "arm.urdf")
     kept = ("export", result, "--to", "urdf", "-o", tmp_path / "arm.urdf", "--keep-anyway")
     assert run(*kept) == 0
-    assert arm_error(cell, mc.load_robot(tmp_path / "arm.urdf")) < 0.03
+    assert rms_arm_error_mm(cell, mc.load_robot(tmp_path / "arm.urdf")) < 0.03
 
 
 @pytest.mark.parametrize(

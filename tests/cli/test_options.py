@@ -11,16 +11,16 @@ import pytest
 from click.testing import CliRunner
 
 import minimax_cal as mc
-from minimax_cal.cli.options import options_from, options_of
-from minimax_cal.cli.schemas import KINDS, schema_of
-from minimax_cal.correcting.compensate import compensate
+from minimax_cal.cli.options import options_from_dataclass, options_from_parameters
+from minimax_cal.cli.schemas import SCHEMA_CLASS_BY_KIND, build_file_schema
+from minimax_cal.compensation.joint_compensation import compensate
+from minimax_cal.core.option_fields import Option
+from minimax_cal.fitting.multi_instrument.options import RelativeOptions
 from minimax_cal.fitting.options import Options
-from minimax_cal.fitting.several.options import RelativeOptions
-from minimax_cal.ground.options import Option
-from minimax_cal.judging.maps import Grid
 from minimax_cal.modelling.simulate import Truth
-from minimax_cal.planning.options import PlanOptions
+from minimax_cal.planning.plan_options import PlanOptions
 from minimax_cal.robots.robot import robot_from_dict
+from minimax_cal.validation.workspace_maps import MapGrid
 
 # ---- options -------------------------------------------------------------------------------------
 
@@ -38,10 +38,10 @@ def given(options: Any, *arguments: object) -> dict[str, Any]:
     return got
 
 
-@pytest.mark.parametrize("kind", [Options, RelativeOptions, PlanOptions, Truth, Grid])
+@pytest.mark.parametrize("kind", [Options, RelativeOptions, PlanOptions, Truth, MapGrid])
 def test_defaults_are_those_of_the_fields(kind):
     defaults = vars(kind())
-    found = given(options_from(kind))
+    found = given(options_from_dataclass(kind))
     assert found
     for name, value in found.items():
         if name != "joints":  # texts until the robot is known
@@ -54,7 +54,7 @@ def test_defaults_are_those_of_the_fields(kind):
 
 def test_units_arrive_in_si():
     found = given(
-        options_from(PlanOptions),
+        options_from_dataclass(PlanOptions),
         *("--acceptance", 90, "--noise", 20, "--body", 80, "--range", "1:20"),
         *("--elevation", "-90:45", "--tracker", "3000,0,500", "--target", "1,2,3"),
     )
@@ -68,11 +68,13 @@ def test_units_arrive_in_si():
 
 
 def test_some_fields_and_arguments_of_a_function():
-    assert set(given(options_from(Options, "seed", "qp"))) == {"seed", "qp"}
-    told = options_of(compensate, most_change=Option(unit="deg", flag="--max-change"))
+    assert set(given(options_from_dataclass(Options, "seed", "qp"))) == {"seed", "qp"}
+    told = options_from_parameters(compensate, most_change=Option(unit="deg", flag="--max-change"))
     assert given(told) == {"most_change": pytest.approx(np.pi / 36.0)}
     assert given(told, "--max-change", 90) == {"most_change": pytest.approx(np.pi / 2.0)}
-    several = given(options_from(Options), "--fix", "a1, d2", "--fix", "beta*", "--prior", "a*=1mm")
+    several = given(
+        options_from_dataclass(Options), "--fix", "a1, d2", "--fix", "beta*", "--prior", "a*=1mm"
+    )
     assert several["fix"] == ("a1", "d2", "beta*")
     assert several["priors"] == {"a*": 1e-3}
 
@@ -91,20 +93,20 @@ WHOLE = {
 
 def faults(kind: str, content: Any) -> list[str]:
     jsonschema = pytest.importorskip("jsonschema", reason="jsonschema is not installed")
-    jsonschema.Draft202012Validator.check_schema(schema_of(kind))
-    checker = jsonschema.Draft202012Validator(schema_of(kind))
+    jsonschema.Draft202012Validator.check_schema(build_file_schema(kind))
+    checker = jsonschema.Draft202012Validator(build_file_schema(kind))
     return [f"{list(fault.path)}: {fault.message}"[:200] for fault in checker.iter_errors(content)]
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", SCHEMA_CLASS_BY_KIND)
 def test_each_is_a_schema(kind, says):
     printed = json.loads(says("robots --schema", kind).out)
-    assert printed == schema_of(kind)
+    assert printed == build_file_schema(kind)
     assert faults(kind, [])
 
 
 def test_a_robot_file_is_meant_unless_told(says):
-    assert json.loads(says("robots --schema").out) == schema_of("robot")
+    assert json.loads(says("robots --schema").out) == build_file_schema("robot")
 
 
 @pytest.mark.parametrize("name", mc.builtin_robots())

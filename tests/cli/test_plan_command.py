@@ -12,10 +12,10 @@ from conftest import invoked
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.cli.compensate import read_targets
+from minimax_cal.cli.compensate import read_target_file
 from minimax_cal.cli.plan import plan_command
 from minimax_cal.modelling.simulate import Simulation
-from minimax_cal.planning.route import ANGLES
+from minimax_cal.planning.visit_route import RADIANS_TO_ANGLE_UNIT
 
 FEW = ("--candidates", 80, "-q")
 WIDE = ("--acceptance", 180)
@@ -79,7 +79,7 @@ def test_the_file_says_its_units(planned):
 
 def test_compensate_reads_the_stops(planned):
     _, rows = rows_of(planned)
-    given = read_targets(planned)
+    given = read_target_file(planned)
     assert_allclose(np.degrees(given.data.q), np.array([row[2:8] for row in rows], dtype=float))
     assert given.data.columns["approach3"].tolist() == [float(row[10]) for row in rows]
 
@@ -125,7 +125,7 @@ def test_radians_and_slides(folder):
     q = np.array([row[2 : 2 + robot.joints] for row in rows], dtype=float)
     q = q * np.where(robot.prismatic, 1e-3, 1.0)
     assert np.all((q >= robot.lower - 1e-9) & (q <= robot.upper + 1e-9))
-    assert set(ANGLES) == {"deg", "rad"}
+    assert set(RADIANS_TO_ANGLE_UNIT) == {"deg", "rad"}
 
 
 def test_json_alone_on_stdout():

@@ -13,14 +13,14 @@ from conftest import run
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.diagnosing.result import load_diagnosis
-from minimax_cal.fitting.opened import open_result
-from minimax_cal.fitting.several.stack import Block
+from minimax_cal.diagnosing.diagnosis import load_diagnosis
+from minimax_cal.fitting.multi_instrument.instrument_stack import InstrumentBlock
+from minimax_cal.fitting.opened_results import open_result
 from minimax_cal.instruments import flange_poses, write_relative
-from minimax_cal.instruments.sockets import Visits
-from minimax_cal.instruments.wires import Lengths
+from minimax_cal.instruments.sockets import SocketVisits
+from minimax_cal.instruments.wires import WireLengths
 from minimax_cal.modelling.cell import Cell
-from minimax_cal.modelling.model import Model
+from minimax_cal.modelling.point_model import PointModel
 from minimax_cal.modelling.simulate import Truth, simulate
 
 # ---- results as input ----------------------------------------------------------------------------
@@ -98,7 +98,7 @@ def test_rungs_are_those_of_the_ladder(here, found, capsys, refuses):
 def test_a_relative_calibration_is_placed_by_the_data(here):
     data = mc.read_measurements(here / "gap.csv")
     known = open_result(here / "relative.json")
-    cell, before, said = known.placed_by(data)
+    cell, before, said = known.place_on_data(data)
     assert before is not None
     assert "knows no base and no targets" in said[0]
     assert mc.evaluate(cell, data).rms_mm < mc.evaluate(before, data).rms_mm
@@ -221,8 +221,8 @@ def rounded(errors: Callable[..., Any]) -> Callable[..., Any]:
 def exact() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for owner, name in [
-            (Cell, "error"), (Model, "error"), (Model, "error_of"),
-            (Block, "rows"), (Lengths, "errors"), (Visits, "errors"),
+            (Cell, "error"), (PointModel, "point_errors"), (PointModel, "block_errors_and_points"),
+            (InstrumentBlock, "rows"), (WireLengths, "part_errors"), (SocketVisits, "part_errors"),
         ]:  # fmt: skip
             patch.setattr(owner, name, rounded(getattr(owner, name)))
         yield
@@ -262,8 +262,8 @@ def test_commands_take_exact_points(off, tmp_path, robot):
 def test_instruments_take_exact_rows(kind, tmp_path):
     from experiments import relative
 
-    arm = relative.Arm.of("irb2600", 3, 0.0)
-    made = relative.SIMULATORS[kind](arm, np.random.default_rng(3), 60, 0.0)
+    arm = relative.ImperfectArm.draw("irb2600", 3, 0.0)
+    made = relative.MEASUREMENT_SIMULATORS[kind](arm, np.random.default_rng(3), 60, 0.0)
     write_relative(tmp_path / "d.csv", made.data)
     assert run("relative irb2600", tmp_path / "d.csv", "--diagnose") == 0
 

@@ -16,8 +16,8 @@ from conftest import run
 from fuzz.material import material
 from measuring.test_exports import workbook
 
-from minimax_cal.ground import files, journal
-from minimax_cal.ground.errors import CalibrationError
+from minimax_cal.core import files, write_journal
+from minimax_cal.core.errors import CalibrationError
 
 POSIX = pytest.mark.skipif(sys.platform == "win32", reason="limits and signals are those of POSIX")
 PATIENCE = 60.0  # seconds
@@ -33,11 +33,11 @@ found = importlib.machinery.PathFinder.find_spec
 def find_spec(name, path=None, target=None):
     return None if name.partition(".")[0] in absent else found(name, path, target)
 importlib.machinery.PathFinder.find_spec = find_spec
-from minimax_cal.cli.running import outcome
+from minimax_cal.cli.command_runner import run_command_line
 for line in sys.argv[2:]:
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        code = outcome(line.split())
+        code = run_command_line(line.split())
     print(json.dumps([line, code, err.getvalue()]))
 """
 NAMED = {  # a command line, and what it says to install; "" where it needs nothing more
@@ -204,13 +204,13 @@ def test_exit_2_means_that_nothing_was_written(line, folder, monkeypatch, capsys
     """Also where all but the last of several files were written when the disk was full."""
     pytest.importorskip("matplotlib", reason='needs pip install ".[plot]"')
     written: list[Path] = []
-    replace = files.replace_on_disk
+    replace = files.replace_file_durably
 
     def counted(source: Path, path: Path) -> None:
         written.append(path)
         replace(source, path)
 
-    monkeypatch.setattr(files, "replace_on_disk", counted)
+    monkeypatch.setattr(files, "replace_file_durably", counted)
     run(*line.split())
     assert len(written) >= 2, written
     assert all(path.exists() for path in written)
@@ -226,7 +226,7 @@ def test_exit_2_means_that_nothing_was_written(line, folder, monkeypatch, capsys
             raise OSError(28, "No space left on device")
         counted(source, path)
 
-    monkeypatch.setattr(files, "replace_on_disk", full)
+    monkeypatch.setattr(files, "replace_file_durably", full)
     assert run(*line.split()) == 2
     assert len(written) == last - 1
     assert digest(folder) == before
@@ -256,9 +256,9 @@ def test_a_folder_that_is_read_only_is_one_line(line, folder, monkeypatch, capsy
 
 
 def write_all(*paths: Path) -> None:
-    with journal.all_or_none():
+    with write_journal.undo_writes_on_error():
         for path in paths:
-            files.write_whole(path, "after")
+            files.write_file_atomically(path, "after")
 
 
 def test_all_or_none_puts_back_what_was_there(tmp_path):
@@ -276,17 +276,17 @@ def test_all_or_none_puts_back_what_was_there(tmp_path):
 
 WRITER = """
 import sys
-from minimax_cal.cli import Terminated, raise_on_signals
-from minimax_cal.ground.files import write_whole
-from minimax_cal.ground.journal import all_or_none
-raise_on_signals()
+from minimax_cal.cli import TerminatedBySignal, raise_on_termination_signals
+from minimax_cal.core.files import write_file_atomically
+from minimax_cal.core.write_journal import undo_writes_on_error
+raise_on_termination_signals()
 print("ready", flush=True)
 try:
     while True:
-        with all_or_none():
+        with undo_writes_on_error():
             for name in sys.argv[1:]:
-                write_whole(name, b"new" * 100_000)
-except (KeyboardInterrupt, Terminated):
+                write_file_atomically(name, b"new" * 100_000)
+except (KeyboardInterrupt, TerminatedBySignal):
     sys.exit(3)
 """
 
@@ -295,7 +295,7 @@ except (KeyboardInterrupt, Terminated):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_leaves_no_hidden_file(number, tmp_path, monkeypatch):
     """At any moment of writing several files."""
-    monkeypatch.setenv(files.NO_FSYNC, "1")
+    monkeypatch.setenv(files.NO_FSYNC_VARIABLE, "1")
     for k in range(12):
         process = started(tmp_path, "-c", WRITER, "one", "two")
         assert process.stdout

@@ -12,14 +12,23 @@ from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
 from minimax_cal.cli.compensate import compensate_command
-from minimax_cal.correcting.compensate import FRAMES, Compensation, compensate, path_of
-from minimax_cal.correcting.deliverable import Delivered, Figures
-from minimax_cal.correcting.target_file import ADDED, read_targets
-from minimax_cal.ground.arrays import Array
-from minimax_cal.modelling.effects.table import NOTHING, Fitted, Term
-from minimax_cal.modelling.reach import Outcome, Reach, arm_of
+from minimax_cal.compensation.deliverable import AccuracyFigures, Delivered
+from minimax_cal.compensation.joint_compensation import (
+    NOMINAL_FRAME_CHOICES,
+    Compensation,
+    compensate,
+    convert_targets_to_measurements,
+)
+from minimax_cal.compensation.target_file import ADDED_TARGET_COLUMNS, read_target_file
+from minimax_cal.core.arrays import Array
+from minimax_cal.modelling.effects.table import NO_EFFECTS, Fitted, Term
+from minimax_cal.modelling.inverse_with_effects import (
+    InverseOutcome,
+    InverseProblem,
+    build_flange_cell,
+)
 from minimax_cal.modelling.simulate import Simulation, Truth, gravity, simulate
-from minimax_cal.robots.sampling import random_poses
+from minimax_cal.robots.joint_sampling import random_joint_values_above_floor
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +59,7 @@ def off(robot: mc.Robot, rng: np.random.Generator, size: float = 1.0) -> mc.Robo
     return robot.with_mdh(robot.mdh + size * error)
 
 
-def cell_of(robot: mc.Robot, effects: Fitted = NOTHING) -> mc.Cell:
+def cell_of(robot: mc.Robot, effects: Fitted = NO_EFFECTS) -> mc.Cell:
     spots = np.array([[0.1, 0.0, 0.03], [-0.05, 0.09, 0.03], [-0.05, -0.09, 0.03]])
     return mc.Cell(robot, np.eye(4), ("smr1", "smr2", "smr3"), spots, effects)
 
@@ -60,7 +69,7 @@ def test_joints_that_count_the_other_way(robot, rng):
     sign = np.array([1.0, -1.0, 1.0, -1.0, -1.0, 1.0])
     wrong = off(robot, rng)
     stiff = Fitted((Term("link_bending", "L2"),), (np.array([1e-6]),))
-    q = regular(robot, random_poses(robot, 40, rng))
+    q = regular(robot, random_joint_values_above_floor(robot, 40, rng))
     plain = compensate(cell_of(wrong, stiff), q, robot, frame="own")
     other = replace(robot, sign=sign, lower=-robot.upper, upper=-robot.lower)
     turned = replace(wrong, sign=sign, lower=-robot.upper, upper=-robot.lower)
@@ -86,7 +95,7 @@ def apart(one: Array, other: Array) -> tuple[Array, Array]:
 
 
 def test_the_true_robot_comes_to_the_nominal_targets(robot, sim, fit):
-    q = regular(robot, random_poses(robot, 400, np.random.default_rng(10)))
+    q = regular(robot, random_joint_values_above_floor(robot, 400, np.random.default_rng(10)))
     found = compensate(fit, q)
     assert not found.failed.any()
     goal = fit.nominal.predict(q)
@@ -99,28 +108,28 @@ def test_the_true_robot_comes_to_the_nominal_targets(robot, sim, fit):
 
 @pytest.mark.parametrize("frame", ["flange", "own"])
 def test_frames_lay_the_flange_where_they_say(robot, sim, fit, frame):
-    q = regular(robot, random_poses(robot, 100, np.random.default_rng(3)))
+    q = regular(robot, random_joint_values_above_floor(robot, 100, np.random.default_rng(3)))
     found = compensate(fit, q, frame=frame)
     assert not found.failed.any()
     base = fit.nominal.base if frame == "flange" else fit.cell.base
-    goal = replace(fit.cell, robot=robot, base=base, effects=NOTHING).predict(q)
+    goal = replace(fit.cell, robot=robot, base=base, effects=NO_EFFECTS).predict(q)
     after = np.linalg.norm(true_points(sim, found.q) - goal, axis=-1)
     assert 1e3 * after.max() < 3.0 * fit.accuracy["holdout"].rms_mm
 
 
 def test_an_arm_as_drawn_is_left_alone(robot, rng):
-    q = random_poses(robot, 50, rng)
-    for frame in FRAMES:
+    q = random_joint_values_above_floor(robot, 50, rng)
+    for frame in NOMINAL_FRAME_CHOICES:
         found = compensate(cell_of(robot), q, robot, frame=frame)
         assert_allclose(found.q, q, rtol=0, atol=1e-9)
-        assert set(found.outcome) == {Outcome.REACHED}
+        assert set(found.outcome) == {InverseOutcome.REACHED}
 
 
 def test_limits_hold_and_are_reported(robot, rng):
     real = robot.with_mdh(robot.mdh + np.array([0, 0, -0.01, 0, 0]) * np.eye(6)[:, [2]])
     q = np.array([[0.3, 0.2, 1.3085, 0.4, 0.8, 0.1], [0.3, 0.2, 0.5, 0.4, 0.8, 0.1]])
     found = compensate(cell_of(real), q, robot, frame="own")
-    assert found.outcome == (Outcome.LIMIT, Outcome.REACHED)
+    assert found.outcome == (InverseOutcome.LIMIT, InverseOutcome.REACHED)
     assert found.q[0, 2] == robot.upper[2]
     assert np.all((found.q >= robot.lower) & (found.q <= robot.upper))
     # least squares: no allowed motion of the other joints lowers the cost
@@ -150,14 +159,17 @@ def test_a_stretched_arm_that_is_too_short_gets_as_near_as_it_can(robot):
 
 
 def test_a_straight_wrist_is_not_swung_about(robot, rng):
-    q = random_poses(robot, 30, rng)
+    q = random_joint_values_above_floor(robot, 30, rng)
     q[:, 4] = 0.0
     found = compensate(cell_of(off(robot, rng)), q, robot, frame="own")
     change = np.abs(found.q - q).max(axis=1)
     missed = found.failed
     assert missed.any()
     assert change.max() < np.pi / 36 + 1e-12
-    assert {o for o in found.outcome if o.failed} <= {Outcome.SINGULAR, Outcome.CHANGE}
+    assert {o for o in found.outcome if o.failed} <= {
+        InverseOutcome.SINGULAR,
+        InverseOutcome.CHANGE,
+    }
     before = np.hypot(found.distance_before, 0.1 * found.angle_before)
     assert np.all(np.hypot(found.distance, 0.1 * found.angle) < 1.1 * before)
 
@@ -167,7 +179,7 @@ def test_scara_corrects_what_four_joints_can(rng):
     real = off(robot, rng)
     q = rng.uniform([-1.5, 0.6, 0.03, -2.0], [1.5, 2.0, 0.17, 2.0], (40, 4))
     found = compensate(cell_of(real), q, robot, frame="own")
-    assert set(found.outcome) <= {Outcome.CLOSEST, Outcome.REACHED}
+    assert set(found.outcome) <= {InverseOutcome.CLOSEST, InverseOutcome.REACHED}
     assert not found.failed.any()
     assert found.distance.max() < 1e-5 < 1e-4 < found.distance_before.max()
     assert found.angle.max() > 1e-5  # the tilt remains
@@ -175,7 +187,7 @@ def test_scara_corrects_what_four_joints_can(rng):
     edge = q[:1].copy()
     edge[0, 2] = 0.0
     raised = robot.with_mdh(robot.mdh + np.array([0, 1e-3, 0, 0, 0]) * np.eye(4)[:, [2]])
-    assert compensate(cell_of(raised), edge, robot, frame="own").outcome == (Outcome.LIMIT,)
+    assert compensate(cell_of(raised), edge, robot, frame="own").outcome == (InverseOutcome.LIMIT,)
 
 
 def test_a_redundant_arm_changes_least(rng):
@@ -188,9 +200,16 @@ def test_a_redundant_arm_changes_least(rng):
     real = off(seven, rng, 0.1)
     q = rng.uniform(0.5, 1.2, (20, 7))
     found = compensate(cell_of(real), q, seven, frame="own")
-    assert set(found.outcome) == {Outcome.REACHED}
-    reach = Reach(arm_of(cell_of(real)), path_of(q, real, 0.0), seven.pose(q), 0.1, 1e-5, 0.1)
-    residual, jacobian = reach.missing(q, reach.goal, np.zeros_like(q))
+    assert set(found.outcome) == {InverseOutcome.REACHED}
+    reach = InverseProblem(
+        build_flange_cell(cell_of(real)),
+        convert_targets_to_measurements(q, real, 0.0),
+        seven.pose(q),
+        0.1,
+        1e-5,
+        0.1,
+    )
+    residual, jacobian = reach.residual_and_jacobian(q, reach.goal, np.zeros_like(q))
     least = (np.linalg.pinv(jacobian) @ residual[..., None])[..., 0]
     assert_allclose(found.q - q, least, rtol=0, atol=0.02 * np.abs(least).max())
 
@@ -213,22 +232,22 @@ def effect(name: str, place: str, value: list[float], **choice: float) -> Fitted
     ids=lambda e: e.terms[0].label,
 )
 def test_every_kind_of_effect_is_corrected(robot, rng, effects):
-    q = regular(robot, random_poses(robot, 60, rng))
+    q = regular(robot, random_joint_values_above_floor(robot, 60, rng))
     columns = {"temperature": np.full(len(q), 32.0), "payload": np.full(len(q), 12.0)}
-    data = replace(path_of(q, robot, 0.0), columns=columns).in_visit_order()
+    data = replace(convert_targets_to_measurements(q, robot, 0.0), columns=columns).in_visit_order()
     cell = cell_of(off(robot, rng), effects)
     found = compensate(cell, data, robot, frame="own")
-    assert set(found.outcome) == {Outcome.REACHED}
+    assert set(found.outcome) == {InverseOutcome.REACHED}
     # as measured points: an independent way through Cell.follow
     goal = cell_of(robot).predict(q)
     reached = cell.follow(replace(data, q=found.q))
     assert_allclose(reached, goal, rtol=0, atol=1e-7)
-    plain = compensate(replace(cell, effects=NOTHING), data, robot, frame="own")
+    plain = compensate(replace(cell, effects=NO_EFFECTS), data, robot, frame="own")
     assert np.abs(cell.follow(replace(data, q=plain.q)) - goal).max() > 1e-5
 
 
 def test_what_moves_only_reflectors_is_left_out(robot, rng):
-    q = regular(robot, random_poses(robot, 20, rng))
+    q = regular(robot, random_joint_values_above_floor(robot, 20, rng))
     cell = cell_of(robot, effect("target_offset", "all", [1e-3]))
     found = compensate(cell, q, robot)
     assert_allclose(found.q, q, rtol=0, atol=1e-9)
@@ -242,19 +261,21 @@ def test_play_that_pulls_both_ways_is_told(robot):
     q[:, 4] += [0.0, 0.1, 0.1 - 2e-4]
     cell = cell_of(robot, effect("backlash", "J5", [1e-3]))
     found = compensate(cell, q, robot, frame="own")
-    assert found.outcome == (Outcome.REACHED, Outcome.REACHED, Outcome.STALLED)
+    assert found.outcome == (InverseOutcome.REACHED, InverseOutcome.REACHED, InverseOutcome.STALLED)
     assert_allclose(found.q[1, 4] - q[1, 4], -5e-4, rtol=0, atol=1e-9)
     assert_allclose(found.angle[2], 1e-3, rtol=0.1)  # told as it is, not as hoped
     assert "stalled at line 3" in found.complaint()
-    sided = replace(path_of(q, robot, 0.0), columns={"approach5": np.ones(3)})
+    sided = replace(
+        convert_targets_to_measurements(q, robot, 0.0), columns={"approach5": np.ones(3)}
+    )
     again = compensate(cell, sided, robot, frame="own")
-    assert set(again.outcome) == {Outcome.REACHED}
+    assert set(again.outcome) == {InverseOutcome.REACHED}
     assert_allclose(again.q[:, 4] - q[:, 4], -5e-4, rtol=0, atol=1e-9)
 
 
 def test_the_saved_fit_gives_the_same(robot, fit, saved):
-    q = regular(robot, random_poses(robot, 50, np.random.default_rng(8)))
-    for frame in FRAMES:
+    q = regular(robot, random_joint_values_above_floor(robot, 50, np.random.default_rng(8)))
+    for frame in NOMINAL_FRAME_CHOICES:
         here, there = compensate(fit, q, frame=frame), compensate(saved, q, frame=frame)
         assert_allclose(here.q, there.q, rtol=0, atol=1e-8)
     given = compensate(saved, q, robot)
@@ -294,7 +315,7 @@ def test_tables_hold_what_a_hand_reckons():
         angle=np.array([0.0, 2e-6]),
         distance_before=np.array([3e-3, 4e-3]),
         angle_before=np.array([1e-3, 7e-3]),
-        outcome=(Outcome.REACHED, Outcome.LIMIT),
+        outcome=(InverseOutcome.REACHED, InverseOutcome.LIMIT),
         sliding=np.array([False, True]),
         line=np.array([2, 3]),
         name="two",
@@ -303,7 +324,7 @@ def test_tables_hold_what_a_hand_reckons():
     )
     own = Delivered(
         "compensate", "geometry", (), (), cell_of(mc.load_robot("ur10")), None,
-        Figures(0.07, 0.2, 0.08, 0.1, 0.3), Figures(),
+        AccuracyFigures(0.07, 0.2, 0.08, 0.1, 0.3), AccuracyFigures(),
     )  # fmt: skip
     assert [row[0] for row in found.tables()[0].rows] == ["as commanded", "missed, by the model"]
     found = replace(found, delivered=own)
@@ -313,7 +334,10 @@ def test_tables_hold_what_a_hand_reckons():
     small = (4e-3, 4e-3, 2e-3, 2e-3)
     assert pose.rows[1] == ("missed, by the model", 1, *map(pytest.approx, small))
     assert pose.rows[2][:4] == ("corrected, on the arm", 1, 0.07, 0.2)
-    assert ends.rows == (("reached", 1, Outcome.REACHED.advice), ("limit", 1, Outcome.LIMIT.advice))
+    assert ends.rows == (
+        ("reached", 1, InverseOutcome.REACHED.advice),
+        ("limit", 1, InverseOutcome.LIMIT.advice),
+    )
     assert joints.rows == (
         ("J1", "mrad", pytest.approx(np.sqrt(0.5)), pytest.approx(1.0)),
         ("J2", "mm", pytest.approx(np.sqrt(2.0)), pytest.approx(2.0)),
@@ -333,12 +357,12 @@ def test_tables_hold_what_a_hand_reckons():
                    map(pytest.approx, (4e-3, 2e-3, 4.0, 7.0)), strict=True)),
     }  # fmt: skip
     for count, says in ((8, "line 1, 2, 3, 4, 5, 6, 7, 8: "), (9, "7, 8 and 1 more: ")):
-        many = replace(found, outcome=(Outcome.LIMIT,) * count, line=np.arange(count) + 1)
+        many = replace(found, outcome=(InverseOutcome.LIMIT,) * count, line=np.arange(count) + 1)
         assert says in many.complaint()
 
 
 def test_the_start_of_the_session_and_20_degrees_are_taken(robot, rng):
-    q = regular(robot, random_poses(robot, 20, rng))[:2]
+    q = regular(robot, random_joint_values_above_floor(robot, 20, rng))[:2]
     warming = cell_of(robot, effect("thermal_growth", "all", [3e-4], constant=0.5, apart=0.0))
     first = compensate(warming, q, robot, frame="own")
     last = compensate(warming, q, robot, frame="own", clock=1.0)
@@ -347,7 +371,9 @@ def test_the_start_of_the_session_and_20_degrees_are_taken(robot, rng):
     assert any("taken at 0 of it" in notice for notice in first.notices)
     assert any("taken at 1 of it" in notice for notice in last.notices)
     hot = cell_of(robot, effect("thermal_growth", "all", [3e-4], temperature=1.0, apart=0.0))
-    measured = replace(path_of(q, robot, 0.0), columns={"temperature": np.full(2, 30.0)})
+    measured = replace(
+        convert_targets_to_measurements(q, robot, 0.0), columns={"temperature": np.full(2, 30.0)}
+    )
     for targets, told in ((q, True), (measured, False)):
         notices = compensate(hot, targets, robot, frame="own").notices
         assert any("taken at 20 C" in notice for notice in notices) == told
@@ -356,7 +382,12 @@ def test_the_start_of_the_session_and_20_degrees_are_taken(robot, rng):
 @pytest.mark.parametrize(("part", "told"), [(6, False), (7, True), (3, True), (4, False)])
 def test_a_compliance_of_measured_torques_asks_for_them(part, told, robot, rng):
     cell = cell_of(robot, effect("joint_compliance", "J2", [2e-6], parts=2.0**part))
-    found = compensate(cell, regular(robot, random_poses(robot, 20, rng))[:1], robot, frame="own")
+    found = compensate(
+        cell,
+        regular(robot, random_joint_values_above_floor(robot, 20, rng))[:1],
+        robot,
+        frame="own",
+    )
     assert any("fitted to measured torques" in notice for notice in found.notices) == told
 
 
@@ -380,8 +411,8 @@ def test_command_keeps_the_file_and_corrects_the_joints(saved, tmp_path):
     assert "column speed is kept and not used" in notes
     with out.open() as stream:
         header, *body = csv.reader(stream)
-    assert header == [*DEGREES.split(","), *ADDED]
-    expected = compensate(saved, read_targets(targets).data)
+    assert header == [*DEGREES.split(","), *ADDED_TARGET_COLUMNS]
+    expected = compensate(saved, read_target_file(targets).data)
     for i, row in enumerate(body):
         assert row[0] == rows[i].split(",")[0]
         assert row[7:9] == rows[i].split(",")[7:9]
@@ -404,10 +435,10 @@ def test_targets_in_german_come_back_under_their_names(saved, tmp_path):
     german, out = tmp_path / "Ziele.csv", tmp_path / "out.csv"
     german.write_bytes(f"{head}\r\nGreifpunkt ä;10;20,5;-15;30;40;50;A\r\n".encode("cp1252"))
     same = write(tmp_path / "t.csv", DEGREES, "pick,10,20.5,-15,30,40,50,0,v")
-    assert_allclose(read_targets(german).data.q, read_targets(same).data.q, rtol=0, atol=0)
+    assert_allclose(read_target_file(german).data.q, read_target_file(same).data.q, rtol=0, atol=0)
     assert run(saved, german, "-o", out)[0] == 0
     with out.open() as stream:
-        assert next(csv.reader(stream)) == [*head.split(";"), *ADDED]
+        assert next(csv.reader(stream)) == [*head.split(";"), *ADDED_TARGET_COLUMNS]
 
 
 def test_command_says_which_targets_are_missed(saved, tmp_path):

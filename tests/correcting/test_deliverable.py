@@ -12,16 +12,16 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import minimax_cal as mc
 from minimax_cal.cli.export import export_command
-from minimax_cal.correcting import deliverable
-from minimax_cal.correcting.deliverable import DELIVERABLES
-from minimax_cal.correcting.export import exported
-from minimax_cal.fitting.accuracy import accuracy
-from minimax_cal.fitting.opened import place
-from minimax_cal.measuring.history import with_history
+from minimax_cal.compensation import deliverable
+from minimax_cal.compensation.deliverable import DELIVERABLES
+from minimax_cal.compensation.robot_export import build_export
+from minimax_cal.fitting.accuracy import summarise_point_errors
+from minimax_cal.fitting.opened_results import place_nominal_arm
 from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.measuring.visit_history import add_history_columns
 from minimax_cal.modelling.effects.table import Fitted
 from minimax_cal.modelling.simulate import Truth, gravity, simulate
-from minimax_cal.robots.gravity import masses_of
+from minimax_cal.robots.gravity_torques import link_masses_and_centres
 from minimax_cal.solvers.status import Status
 from tests.conftest import shared
 from tests.problems_deliverables import READERS, reached
@@ -38,7 +38,7 @@ Split = tuple[mc.Fit, mc.Fit, Measurements]
 
 def split_of(robot: mc.Robot, data: Measurements, effects: str, seed: int = 0) -> Split:
     """Fits with effects and of geometry alone of 60 % of the poses, cross-validated; the others."""
-    data = with_history(data)
+    data = add_history_columns(data)
     new = np.random.default_rng(seed).permutation(data.poses) < 0.4 * data.poses
     train = data.take(~new)
     joint = mc.calibrate(robot, train, "sum", effects=effects, cv=True)
@@ -61,7 +61,7 @@ def real(request: pytest.FixtureRequest) -> Split:
 def check_files(split: Split, folder: Path) -> None:
     """Each file does what the plain fit's does, and what is said of it."""
     joint, plain, new = split
-    alone = accuracy(place(joint.cell.robot, new).error(new)).rms_mm
+    alone = summarise_point_errors(place_nominal_arm(joint.cell.robot, new).error(new)).rms_mm
     formats = [to for to in READERS if to != "ur-yaml" or "UR" in joint.cell.robot.name]
     for to in formats:
         own = mc.deliver(joint, to)
@@ -87,7 +87,7 @@ def test_files_of_real_arms(real, tmp_path):
 def weighed(name: str) -> mc.Robot:
     """An arm whose masses are known, so that a joint's compliance is one number."""
     robot = mc.load_robot(name)
-    mass, com = masses_of(robot)
+    mass, com = link_masses_and_centres(robot)
     return replace(robot, mass=mass, com=com)
 
 
@@ -95,7 +95,7 @@ def weighed(name: str) -> mc.Robot:
 def soft() -> mc.Fit:
     """An arm with a compliance, play, and what ends with its session."""
     robot = weighed("irb2600")
-    data = with_history(simulate(robot, 80, 3, seed=4, truth=Truth(compliance=2e-6)).data)
+    data = add_history_columns(simulate(robot, 80, 3, seed=4, truth=Truth(compliance=2e-6)).data)
     effects = f"{EFFECTS},backlash:J3,tool_flex:all,frame_drift:frame,thermal_growth:all"
     return mc.calibrate(robot, data, "sum", effects=effects)
 
@@ -164,7 +164,7 @@ def test_what_carries_all_is_written_as_it_is():
         close = 0.01 if to == "mjcf" else 1e-12  # sag of sag: no law of a fit has it
         assert found.figures.rms == pytest.approx(found.whole.rms, rel=close)
         assert found.whole.rms == fit.within.after.rms_mm
-    content = json.loads(exported(plain, "json").file.content)
+    content = json.loads(build_export(plain, "json").file.content)
     assert content == plain.to_dict()["robot"]
 
 
@@ -176,13 +176,13 @@ def test_a_file_delivers_what_the_fit_does(soft, tmp_path):
         assert_allclose(other.cell.robot.mdh, one.cell.robot.mdh, rtol=0, atol=1e-12)
         assert other.figures.rms == pytest.approx(one.figures.rms, rel=1e-9)
         assert other.whole.rms == pytest.approx(one.whole.rms, rel=1e-9)
-    written = json.loads(exported(tmp_path / "fit.json", "json").file.content)
+    written = json.loads(build_export(tmp_path / "fit.json", "json").file.content)
     assert written == json.loads((tmp_path / "fit.json").read_text())["robot"]
 
 
 def test_a_result_without_measurements_goes_out_as_it_is(soft, tmp_path):
     soft.save(tmp_path / "fit.json", poses=False)
-    found = exported(tmp_path / "fit.json", "urdf")
+    found = build_export(tmp_path / "fit.json", "urdf")
     assert found.delivered
     assert "fit.json holds no measurements" in found.notices[-1]
     assert_allclose(found.delivered.cell.robot.mdh, soft.robot.mdh, rtol=0, atol=1e-14)
@@ -191,7 +191,7 @@ def test_a_result_without_measurements_goes_out_as_it_is(soft, tmp_path):
     assert arm.cell is soft.cell
     assert arm.carries == CARRIED["mjcf"]
     assert "holds no measurements" in arm.sentence()
-    assert exported("irb120", "json").to_dict()["delivered"]["holdout_rms_mm"] is None
+    assert build_export("irb120", "json").to_dict()["delivered"]["holdout_rms_mm"] is None
 
 
 def test_a_fit_after_a_check_is_not_made_again(soft):
@@ -282,9 +282,9 @@ def test_a_refit_that_is_no_better_than_the_drawing_is_not_delivered_unasked(mon
     """The joint fit helps; what the file can hold of it does not."""
     made = simulate(mc.load_robot("ur10"), 40, 3, seed=3, truth=Truth(compliance=3e-6))
     joint = mc.calibrate("ur10", made.data, "sum", effects=EFFECTS)
-    refit = deliverable.fit_split
+    refit = deliverable.fit_held_split
     monkeypatch.setattr(
-        deliverable, "fit_split", lambda *a: replace(refit(*a), status=Status.NO_BETTER)
+        deliverable, "fit_held_split", lambda *a: replace(refit(*a), status=Status.NO_BETTER)
     )
     with pytest.raises(mc.CalibrationError, match=r"urdf, without joint compliance.*keep"):
         mc.export(joint, "urdf")
@@ -320,10 +320,10 @@ def test_what_was_fitted_to_measured_torques_is_fitted_to_those_of_gravity(own):
     assert joint.within.after.rms_mm < 0.03  # with the torques, noise alone is left
     known = {name: values for name, values in new.columns.items() if not name.startswith("tau")}
     bare = replace(new, columns=known)
-    alone = accuracy(plain.cell.error(new)).rms_mm
+    alone = summarise_point_errors(plain.cell.error(new)).rms_mm
     for to in ("mjcf", "compensate"):
         made = mc.deliver(joint, to)
-        found = accuracy(made.cell.error(bare)).rms_mm
+        found = summarise_point_errors(made.cell.error(bare)).rms_mm
         assert found == pytest.approx(made.figures.rms, rel=2.0 * TOLD)
         assert found < WORSE * alone
         assert made.figures.rms < WORSE * plain.within.after.rms_mm

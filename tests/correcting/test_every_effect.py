@@ -17,11 +17,11 @@ from dynamics.motions import three_joints
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.correcting.exporters.table import FORMATS
-from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.history import with_history
+from minimax_cal.compensation.exporters.export_formats import DOCUMENTED_EXPORT_FORMATS
+from minimax_cal.core.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.modelling.effects.table import EFFECTS, FREE, Term
+from minimax_cal.measuring.visit_history import add_history_columns
+from minimax_cal.modelling.effects.table import EFFECTS, FREE_CHOICE_KEYS, Term
 from minimax_cal.solvers.status import Status
 
 POSES = 40
@@ -49,7 +49,7 @@ def variants_of(name: str, data: Measurements) -> dict[object, str]:
     """One text, as `--effects` takes it, of each variant of a law, at one place and at all."""
     effect, found = EFFECTS[name], dict[object, str]()
     cell = mc.calibrate(three_joints(), data, "sum").cell
-    scene = cell.scene(with_history(data))
+    scene = cell.pose_arm(add_history_columns(data))
     assert not effect.needs(scene)
     places = tuple(effect.places(scene))
     for place in dict.fromkeys((places[0], places[-1])):
@@ -57,7 +57,9 @@ def variants_of(name: str, data: Measurements) -> dict[object, str]:
         choices += [one for choice in choices for one in effect.entire([choice], ())]
         choices += effect.entire(choices[:2], ()) if place != "all" else ()
         for choice in choices or NOT_FOUND[name]:
-            shape = {k: v if k not in FREE else bool(np.isinf(v)) for k, v in choice.items()}
+            shape = {
+                k: v if k not in FREE_CHOICE_KEYS else bool(np.isinf(v)) for k, v in choice.items()
+            }
             found.setdefault((place == "all", *shape.items()), Term(name, place, choice).text)
     return found
 
@@ -86,7 +88,7 @@ def test_what_is_fitted_leaves_in_every_form(name, measured, tmp_path):
         fit = mc.calibrate(three_joints(), data, "sum", effects=text)
         assert fit.status is not Status.FAILED, text
         assert name in {term.effect for term in fit.cell.effects.terms}
-        for to in FORMATS:
+        for to in DOCUMENTED_EXPORT_FORMATS:
             path = tmp_path / f"arm.{to}.xml"
             why = one_line(lambda: mc.export(fit, to, path, keep_anyway=True, notify=id))  # noqa: B023
             assert (NEVER_MADE[to] in why) if to in NEVER_MADE else not why, (text, to, why)
@@ -112,7 +114,7 @@ def test_a_file_that_cannot_be_made_is_a_row_that_says_why(measured, tmp_path, s
 
 def test_a_deliverable_that_fails_does_not_cost_the_report(measured, tmp_path, monkeypatch):
     """Whatever ends its fit: the others are judged."""
-    from minimax_cal.correcting import deliverable
+    from minimax_cal.compensation import deliverable
 
     fit = mc.calibrate(three_joints(), measured[0], "sum", effects="encoder_gain:all")
     whole = deliverable.deliver

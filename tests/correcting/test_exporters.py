@@ -17,15 +17,24 @@ from numpy.testing import assert_allclose
 
 import minimax_cal as mc
 from minimax_cal.cli.export import export_command
-from minimax_cal.correcting.export import exported
-from minimax_cal.correcting.exporters import Job, export
-from minimax_cal.correcting.exporters.table import FORMATS
-from minimax_cal.ground.errors import CalibrationError, OptionError
+from minimax_cal.compensation.exporters import ExportJob, build_exported_file
+from minimax_cal.compensation.exporters.export_formats import DOCUMENTED_EXPORT_FORMATS
+from minimax_cal.compensation.robot_export import build_export
+from minimax_cal.core.errors import CalibrationError, OptionError
 from minimax_cal.modelling.simulate import Simulation, simulate
 from minimax_cal.robots.robot import robot_from_dict
-from minimax_cal.robots.transforms import from_rpy, inverse, link, turn
-from minimax_cal.robots.urdf import random_joints, tip_poses, to_robot
+from minimax_cal.robots.transforms import (
+    axis_rotation,
+    invert_transform,
+    link_transform,
+    transform_from_xyz_rpy,
+)
 from minimax_cal.robots.urdf_file import parse_urdf
+from minimax_cal.robots.urdf_robot import (
+    convert_urdf_to_robot,
+    random_joint_values_in_limits,
+    tip_poses,
+)
 
 EXACT = dict(rtol=0, atol=1e-9)
 HALF = "1.5707963267948966"
@@ -80,10 +89,10 @@ def bent(robot: mc.Robot, size: float = 1e-3, last: bool = False) -> mc.Robot:
     return robot.with_mdh(robot.mdh + change)
 
 
-def job_of(robot: mc.Robot, nominal: mc.Robot | None = None) -> Job:
+def job_of(robot: mc.Robot, nominal: mc.Robot | None = None) -> ExportJob:
     before = nominal or robot
     compliance = np.full(robot.joints, np.nan)
-    return Job(robot, before, "fit.json", compliance, fitted=nominal is not None)
+    return ExportJob(robot, before, "fit.json", compliance, fitted=nominal is not None)
 
 
 NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
@@ -95,7 +104,7 @@ def offsets_of(text: str) -> np.ndarray:
 
 
 def poses_of(robot: mc.Robot) -> tuple[np.ndarray, np.ndarray]:
-    q = random_joints(robot.lower, robot.upper, 30)
+    q = random_joint_values_in_limits(robot.lower, robot.upper, 30)
     return q, robot.pose(q)
 
 
@@ -113,10 +122,10 @@ def test_new_urdf(name):
     robot = bent(mc.load_robot(name), last=True)
     mass, com = np.arange(robot.joints) + 1.0, np.ones((robot.joints, 3)) * [0.1, 0.2, 0.3]
     robot = replace(robot, mass=mass, com=com)
-    made = export(job_of(robot), "urdf")
+    made = build_exported_file(job_of(robot), "urdf")
     assert any("inertias are assumed" in notice for notice in made.notices)
     q, poses = poses_of(robot)
-    model = to_robot(parse_urdf(made.content))
+    model = convert_urdf_to_robot(parse_urdf(made.content))
     again = robot_from_dict(model.content)
     assert_allclose(tip_poses(model.chain, q), poses, **EXACT)
     assert_allclose(model.base @ again.pose(q) @ model.tool, poses, **EXACT)
@@ -162,10 +171,10 @@ def theirs_at(text: str, q: np.ndarray, frame: str) -> np.ndarray:
 @pytest.mark.parametrize("last", [False, True])
 def test_original_urdf_with_corrected_origins(original, last):
     nominal = mc.load_robot(original)
-    model = to_robot(parse_urdf(original.read_bytes()))
+    model = convert_urdf_to_robot(parse_urdf(original.read_bytes()))
     robot = bent(nominal, last=last)
     job = replace(job_of(robot, nominal), originals=(model.urdf,))
-    made = export(job, "urdf").content
+    made = build_exported_file(job, "urdf").content
     q, poses = poses_of(robot)
     expected = model.base @ poses @ model.tool
     assert_allclose(theirs_at(made.decode(), q, "tool0"), expected, **EXACT)
@@ -175,7 +184,7 @@ def test_original_urdf_with_corrected_origins(original, last):
     assert len(changed) == 5 + last
     assert all(b"<origin" in line or b"rpy=" in line for line in changed)
     nothing = replace(job_of(nominal, nominal), originals=(model.urdf,))
-    assert export(nothing, "urdf").content == original.read_bytes()
+    assert build_exported_file(nothing, "urdf").content == original.read_bytes()
 
 
 @pytest.mark.dev
@@ -183,9 +192,9 @@ def test_fit_of_the_builtin_robot_on_a_urdf_with_other_frames(original):
     nominal = mc.load_robot("ur10")
     robot = bent(nominal)
     urdf = parse_urdf(original.read_bytes(), "ur10.urdf")
-    made = export(replace(job_of(robot, nominal), originals=(urdf,)), "urdf")
+    made = build_exported_file(replace(job_of(robot, nominal), originals=(urdf,)), "urdf")
     q, poses = poses_of(replace(robot, lower=np.full(6, -3.0), upper=np.full(6, 3.0)))
-    expected = turn(2, np.pi) @ poses  # base_link is turned against the controller's base
+    expected = axis_rotation(2, np.pi) @ poses  # base_link is turned against the controller's base
     assert_allclose(theirs_at(made.content.decode(), q, "tool0"), expected, **EXACT)
     assert any("base_link to the robot's base" in notice for notice in made.notices)
 
@@ -195,65 +204,70 @@ def test_urdf_that_is_rounded_still_gives_the_calibrated_poses(original):
     nominal = mc.load_robot("ur10")
     robot, rounded = bent(nominal), original.read_bytes().replace(HALF.encode(), b"1.5708")
     urdf = parse_urdf(rounded, "rounded.urdf")
-    made = export(replace(job_of(robot, nominal), originals=(urdf,)), "urdf")
+    made = build_exported_file(replace(job_of(robot, nominal), originals=(urdf,)), "urdf")
     assert any("differ by up to" in notice for notice in made.notices)
     q, poses = poses_of(robot)
     there = theirs_at(made.content.decode(), q, "tool0")
     # up to one constant at either end
     assert_allclose(
-        there @ inverse(there[0]) @ (base := base_between(there, poses)),
-        base @ poses @ inverse(poses[0]),
+        there @ invert_transform(there[0]) @ (base := base_between(there, poses)),
+        base @ poses @ invert_transform(poses[0]),
         rtol=0,
         atol=3e-9,
     )
 
 
 def base_between(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    from minimax_cal.robots.transforms import shared_base
+    from minimax_cal.robots.transforms import fit_shared_base
 
-    return shared_base(one @ inverse(one[0]), other @ inverse(other[0]))
+    return fit_shared_base(one @ invert_transform(one[0]), other @ invert_transform(other[0]))
 
 
 @pytest.mark.dev
 def test_urdf_without_a_fixed_joint_after_the_last(original):
     urdf = parse_urdf(original.read_bytes(), "ur10.urdf")
-    nominal = robot_from_dict(to_robot(urdf, "wrist_3_link").content)
+    nominal = robot_from_dict(convert_urdf_to_robot(urdf, "wrist_3_link").content)
     change = np.zeros((6, 5))
     change[-1, 1:3] = 1e-3  # along the joint axis: the last link's frame moves
     job = replace(job_of(nominal.with_mdh(nominal.mdh + change), nominal), tip="wrist_3_link")
-    made = export(replace(job, originals=(urdf,)), "urdf").content
+    made = build_exported_file(replace(job, originals=(urdf,)), "urdf").content
     q, poses = poses_of(job.robot)
-    base = to_robot(urdf, "wrist_3_link").base
+    base = convert_urdf_to_robot(urdf, "wrist_3_link").base
     assert_allclose(theirs_at(made.decode(), q, "wrist_3_link"), base @ poses, **EXACT)
     change[-1, 0] = 1e-3  # off the axis: this URDF cannot hold it
     job = replace(job, robot=nominal.with_mdh(nominal.mdh + change), originals=(urdf,))
     with pytest.raises(OptionError, match="cannot hold this geometry"):
-        export(job, "urdf")
+        build_exported_file(job, "urdf")
 
 
 def test_another_robot_is_refused(original):
     urdf = parse_urdf(original.read_bytes(), "ur10.urdf")
     irb = mc.load_robot("irb120")
     with pytest.raises(OptionError, match="moves otherwise than the nominal robot"):
-        export(replace(job_of(irb), originals=(urdf,)), "urdf")
+        build_exported_file(replace(job_of(irb), originals=(urdf,)), "urdf")
     ur10 = mc.load_robot("ur10")
     flipped = replace(ur10, sign=ur10.sign * [1, 1, 1, -1, 1, 1])
     with pytest.raises(OptionError, match=r"most at joint 4 \(wrist_1\)"):
-        export(replace(job_of(flipped), originals=(urdf,)), "urdf")
+        build_exported_file(replace(job_of(flipped), originals=(urdf,)), "urdf")
     with pytest.raises(OptionError, match="6 moving joints, the robot 4; name another last link"):
-        export(replace(job_of(mc.load_robot("scara_600")), originals=(urdf,)), "urdf")
+        build_exported_file(replace(job_of(mc.load_robot("scara_600")), originals=(urdf,)), "urdf")
     with pytest.raises(OptionError, match="urdf goes with the format urdf"):
-        export(replace(job_of(ur10), originals=(urdf,)), "json")
+        build_exported_file(replace(job_of(ur10), originals=(urdf,)), "json")
 
 
 @pytest.mark.parametrize("sign", [[1, 1, 1, 1, 1, 1], [1, -1, -1, 1, -1, 1]])
 def test_ur_yaml(sign):
     robot = replace(bent(mc.load_robot("ur10")), sign=np.array(sign, dtype=float))
-    made = export(job_of(robot), "ur-yaml")
+    made = build_exported_file(job_of(robot), "ur-yaml")
     assert not any("has not the axes" in notice for notice in made.notices)
     table = yaml.safe_load(made.content)["kinematics"]
     number = table.pop("hash")
-    assert number == yaml.safe_load(export(job_of(robot), "ur-yaml").content)["kinematics"]["hash"]
+    assert (
+        number
+        == yaml.safe_load(build_exported_file(job_of(robot), "ur-yaml").content)["kinematics"][
+            "hash"
+        ]
+    )
     assert number.startswith("calib_")
     assert number.removeprefix("calib_").isdigit()
     assert list(table) == ["shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3"]
@@ -262,27 +276,31 @@ def test_ur_yaml(sign):
         found = np.eye(4)
         for angle, row in zip(joints, table.values(), strict=True):
             xyz, rpy = ([row[k] for k in names] for names in ("xyz", ("roll", "pitch", "yaw")))
-            found = found @ from_rpy(np.array(xyz), np.array(rpy)) @ turn(2, angle)
+            found = (
+                found
+                @ transform_from_xyz_rpy(np.array(xyz), np.array(rpy))
+                @ axis_rotation(2, angle)
+            )
         assert_allclose(found, pose, **EXACT)
     assert max(abs(v) for row in table.values() for k, v in row.items() if k in "xyz") < 1
-    other = export(job_of(robot.with_mdh(robot.mdh * (1 + 1e-12))), "ur-yaml").content
+    other = build_exported_file(job_of(robot.with_mdh(robot.mdh * (1 + 1e-12))), "ur-yaml").content
     assert yaml.safe_load(other)["kinematics"]["hash"] != number
 
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_ros_yaml(name):
     robot = bent(mc.load_robot(name), last=True)
-    joints = yaml.safe_load(export(job_of(robot), "ros-yaml").content)["joints"]
+    joints = yaml.safe_load(build_exported_file(job_of(robot), "ros-yaml").content)["joints"]
     q, poses = poses_of(robot)
     for values, pose in zip(q, poses, strict=True):
         found = np.eye(4)
         for value, row in zip((*values, 0.0), joints.values(), strict=True):
             origin = {k: np.array(v) for k, v in row["origin"].items()}
-            found = found @ from_rpy(**origin)
+            found = found @ transform_from_xyz_rpy(**origin)
             if row["type"] == "prismatic":
-                found = found @ from_rpy(value * np.array(row["axis"]), np.zeros(3))
+                found = found @ transform_from_xyz_rpy(value * np.array(row["axis"]), np.zeros(3))
             elif row["type"] == "revolute":
-                found = found @ turn(2, value * row["axis"][2])
+                found = found @ axis_rotation(2, value * row["axis"][2])
         assert_allclose(found, pose, **EXACT)
 
 
@@ -291,7 +309,7 @@ def test_ros2_control_holds_the_offsets(name):
     """The drawing's arm at joint = actuator + offset stands where the calibrated one does."""
     data = simulate(name, 40, 3, seed=4).data
     fit = mc.calibrate(name, data, "sum", only="offsets")
-    made = exported(fit, "ros2-control")
+    made = build_export(fit, "ros2-control")
     root = ElementTree.fromstring(made.file.content)
     assert root.tag == "ros2_control"
     parts = root.findall("transmission")
@@ -307,18 +325,18 @@ def test_ros2_control_holds_the_offsets(name):
     assert_allclose(moved, fit.robot.pose(q), **EXACT)
     assert np.abs(offset).max() > 1e-5
     assert len(made.notices) == 1
-    more = exported(mc.calibrate(name, data, "sum"), "ros2-control")
+    more = build_export(mc.calibrate(name, data, "sum"), "ros2-control")
     again = offsets_of(more.file.content.decode())  # fitted again for offsets alone
     assert_allclose(again, offset, rtol=0, atol=1e-9)
     assert "joint offsets alone" in " ".join(more.notices)
     with pytest.raises(OptionError, match="give a fit, no robot"):
-        exported(name, "ros2-control")
+        build_export(name, "ros2-control")
 
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_dh_csv_and_json(name, tmp_path):
     robot = bent(mc.load_robot(name), last=True)
-    made = export(job_of(robot), "dh-csv")
+    made = build_exported_file(job_of(robot), "dh-csv")
     rows = list(csv.DictReader(io.StringIO(made.content.decode())))
     assert "beta is not 0" in made.notices[0]
     keys = ("a_mm", "d_mm", "theta_rad", "alpha_rad", "beta_rad")
@@ -327,7 +345,7 @@ def test_dh_csv_and_json(name, tmp_path):
     q, poses = poses_of(robot)
     assert_allclose(again.pose(q), poses, **EXACT)
     assert [row["type"] == "prismatic" for row in rows] == list(robot.prismatic)
-    (tmp_path / "r.json").write_bytes(export(job_of(robot), "json").content)
+    (tmp_path / "r.json").write_bytes(build_exported_file(job_of(robot), "json").content)
     assert_allclose(mc.load_robot(tmp_path / "r.json").pose(q), poses, **EXACT)
 
 
@@ -350,7 +368,7 @@ def test_moc_holds_the_corrections_of_a_fit():
     robot = bent(nominal, last=True)
     job = replace(job_of(robot, nominal), experimental=True)
     job = replace(job, compliance=np.array([np.nan, 1e-6, 2e-6, np.nan, np.nan, np.nan]))
-    made = export(job, "moc")
+    made = build_exported_file(job, "moc")
     assert made.notices[0].startswith("EXPERIMENTAL")
     text = made.content.decode()
     assert "EXPERIMENTAL" in text
@@ -360,12 +378,12 @@ def test_moc_holds_the_corrections_of_a_fit():
     for i, row in enumerate(found["ARM_CALIB"].values()):
         xyz = [row.get(f"error_offset_{axis}", 0.0) for axis in "xyz"]
         rpy = [row.get(f"error_{name}", 0.0) for name in ("roll", "pitch", "jaw")]
-        pose = link(nominal.mdh[i]) @ from_rpy(np.array(xyz), np.array(rpy))
-        assert_allclose(pose, link(robot.mdh[i]), **EXACT)
+        pose = link_transform(nominal.mdh[i]) @ transform_from_xyz_rpy(np.array(xyz), np.array(rpy))
+        assert_allclose(pose, link_transform(robot.mdh[i]), **EXACT)
     with pytest.raises(OptionError, match="agree \\(experimental\\)"):
-        export(replace(job, experimental=False), "moc")
+        build_exported_file(replace(job, experimental=False), "moc")
     with pytest.raises(OptionError, match="holds no nominal robot"):
-        export(replace(job, fitted=False), "moc")
+        build_exported_file(replace(job, fitted=False), "moc")
 
 
 @pytest.fixture(scope="module")
@@ -386,19 +404,19 @@ def test_a_calibrated_ur10_by_command_in_an_independent_reader(fit, original, tm
     assert result.exception is None, result.output
     assert result.stdout == ""
     assert "fitted without joint coupling; the full model: held-out RMS" in result.stderr
-    robot, model = mc.load_robot(path), to_robot(parse_urdf(original.read_bytes()))
+    robot, model = mc.load_robot(path), convert_urdf_to_robot(parse_urdf(original.read_bytes()))
     q, poses = poses_of(robot)
     text = (tmp_path / "out.urdf").read_text()
     assert_allclose(theirs_at(text, q, "tool0"), model.base @ poses @ model.tool, **EXACT)
     assert_allclose(mc.load_robot(tmp_path / "out.urdf").pose(q).shape, poses.shape)
 
 
-@pytest.mark.parametrize("to", FORMATS)
+@pytest.mark.parametrize("to", DOCUMENTED_EXPORT_FORMATS)
 def test_every_format_by_command(to, fit):
     result = run(fit[0], "--to", to)
     assert result.exception is None
     assert "held-out RMS" in result.stderr
-    other = exported(fit[0], to).file.content.decode()
+    other = build_export(fit[0], to).file.content.decode()
     if to == "ros2-control":  # fitted each time, to rounding
         assert_allclose(offsets_of(other), offsets_of(result.stdout), rtol=0, atol=1e-12)
     elif to == "mjcf":  # so are its springs
@@ -439,7 +457,7 @@ def test_command_on_a_robot_and_its_errors(original, tmp_path):
 def test_an_arm_without_its_nominal_robot(fit, tmp_path):
     content = mc.load_fit(fit[0]).cell.whole()
     (tmp_path / "cell.json").write_text(json.dumps(content))
-    found = exported(tmp_path / "cell.json", "json")
+    found = build_export(tmp_path / "cell.json", "json")
     assert json.loads(found.file.content) == content["robot"]
     assert found.delivered
     assert found.delivered.nominal is None
@@ -449,8 +467,11 @@ def test_an_arm_without_its_nominal_robot(fit, tmp_path):
 
 def test_ur_yaml_refuses_what_it_cannot_hold_and_tells_another_make():
     with pytest.raises(OptionError, match="has no place for a, alpha, beta"):
-        export(job_of(bent(mc.load_robot("ur10"), last=True)), "ur-yaml")
+        build_exported_file(job_of(bent(mc.load_robot("ur10"), last=True)), "ur-yaml")
     with pytest.raises(OptionError, match="six turning joints"):
-        export(job_of(mc.load_robot("scara_600")), "ur-yaml")
+        build_exported_file(job_of(mc.load_robot("scara_600")), "ur-yaml")
     abb = mc.load_robot("irb2600")
-    assert "has not the axes of a Universal Robots arm" in export(job_of(abb), "ur-yaml").notices[0]
+    assert (
+        "has not the axes of a Universal Robots arm"
+        in build_exported_file(job_of(abb), "ur-yaml").notices[0]
+    )

@@ -11,10 +11,10 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
-from minimax_cal.correcting.compensate import compensate
-from minimax_cal.correcting.programs import krl, rapid
-from minimax_cal.correcting.programs.points import MARK
-from minimax_cal.correcting.programs.program import Program, read_program
+from minimax_cal.compensation.joint_compensation import compensate
+from minimax_cal.compensation.programs import krl, rapid
+from minimax_cal.compensation.programs.program_text import CORRECTION_MARK
+from minimax_cal.compensation.programs.robot_program import RobotProgram, read_robot_program
 
 Q = np.array([0.3, 0.2, 0.1, 0.5, 0.8, 0.4])
 TOOL = "PERS tooldata tGrip:=[TRUE,[[20,0,150],[1,0,0,0]],[1,[0,0,1],[1,0,0,0],0,0,0]];"
@@ -40,10 +40,10 @@ def place(robot: mc.Robot) -> str:
     return f"X {x:.6f},Y {y:.6f},Z {z:.6f},A {a:.8f},B {b:.8f},C {c:.8f}"
 
 
-def opened(path: Path, text: str, *frames: str) -> Program:
+def opened(path: Path, text: str, *frames: str) -> RobotProgram:
     """A program of the IRB 2600."""
     path.write_text(text)
-    return read_program(path, mc.load_robot("irb2600"), *frames)
+    return read_robot_program(path, mc.load_robot("irb2600"), *frames)
 
 
 def weld(target: str, *moves: str) -> str:
@@ -139,7 +139,7 @@ def test_points_are_found_wherever_they_stand(target):
     """In a motion of an option, in a call of a routine, and where a variable is set."""
     lines = [f"ArcL {target},v1,s1,w1,z1,tool0;", f"pick {target},tool0;", "VAR robtarget p2;",
              f"p2:={target};", "p3:=[[1,2,3],[1,0,0,0],[0,0,0,0],[0,0,0,0,0,0]];"]  # fmt: skip
-    found = list(rapid.points(rapid.read(weld(target, *lines), "a.mod")))
+    found = list(rapid.find_points(rapid.parse_program(weld(target, *lines), "a.mod")))
     assert sorted(point.line for point in found) == [3, 5, 6, 8]
 
 
@@ -206,12 +206,14 @@ def test_relative_motions_and_offsets_stay(fit, place, tmp_path):
     program = opened(tmp_path / "a.src", axes_and(place, *kept, *spline))
     (said,) = program.data.notices
     assert "12 points are left as programmed, at line 4, 5, 6, 7, 8, 9, 10, 12 ...:" in said
-    assert list(krl.left(program.text))[8:] == [12, 13, 15, 17]
+    assert list(krl.find_unchanged_point_lines(program.text))[8:] == [12, 13, 15, 17]
     assert [point.line for point in program.points] == [2, 3, 22, 23, 25]
-    made = program.corrected(compensate(fit, program.data, program.robot)).decode().splitlines()
+    made = (
+        program.format_corrected(compensate(fit, program.data, program.robot)).decode().splitlines()
+    )
     assert made[4 : 4 + len(kept)] == kept
     assert not set(made) & {spline[0], spline[1], spline[3]}
-    assert made[1] == f"; {MARK}"
+    assert made[1] == f"; {CORRECTION_MARK}"
 
 
 def test_a_program_of_offsets_alone_is_refused(tmp_path):
@@ -236,9 +238,9 @@ def test_a_program_is_corrected_once(name, text, line, fit, target, place, tmp_p
     words = ["compensate", tmp_path / "fit.json"]
     assert run(*words, tmp_path / name, "-o", tmp_path / f"b_{name}", "-q") == 0
     made = (tmp_path / f"b_{name}").read_bytes().decode()
-    assert made.splitlines()[line - 1][2:] == MARK
+    assert made.splitlines()[line - 1][2:] == CORRECTION_MARK
     assert made.count("\r") == (made.count("\n") if "\r" in text else 0)
-    rest = re.sub(rf"\s*[!;] {MARK}\s*", "", made)
+    rest = re.sub(rf"\s*[!;] {CORRECTION_MARK}\s*", "", made)
     numbers = re.compile(r"-?\d+\.\d+")
     assert numbers.sub("", "".join(rest.split())) == numbers.sub("", "".join(
         text.format(body).split()))  # fmt: skip

@@ -9,11 +9,11 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
-from minimax_cal.correcting.compensate import compensate
-from minimax_cal.correcting.programs import krl, rapid
-from minimax_cal.correcting.programs.points import MARK
-from minimax_cal.correcting.programs.program import read_program
-from minimax_cal.ground.errors import DataError
+from minimax_cal.compensation.joint_compensation import compensate
+from minimax_cal.compensation.programs import krl, rapid
+from minimax_cal.compensation.programs.program_text import CORRECTION_MARK
+from minimax_cal.compensation.programs.robot_program import read_robot_program
+from minimax_cal.core.errors import DataError
 
 JOINTS = np.array(
     [
@@ -88,7 +88,7 @@ def data_list(robot: mc.Robot) -> str:
 def unmarked(made: bytes) -> bytes:
     """A corrected program without the line that tells so."""
     lines = made.splitlines(keepends=True)
-    rest = [line for line in lines if MARK.encode() not in line]
+    rest = [line for line in lines if CORRECTION_MARK.encode() not in line]
     assert len(rest) == len(lines) - 1
     return b"".join(rest)
 
@@ -99,11 +99,11 @@ def test_the_calibrated_arm_reaches_the_points(language, fit, robot, tmp_path):
     name, text = ("a.mod", module(robot)) if language == "rapid" else ("a.dat", data_list(robot))
     frames = ("tGrip", "wTable") if language == "rapid" else ()
     (tmp_path / name).write_bytes(text.encode("latin-1"))
-    before = read_program(tmp_path / name, robot, *frames)
+    before = read_robot_program(tmp_path / name, robot, *frames)
     found = compensate(fit, before.data, robot, frame="own")
     assert not found.failed.any()
-    (tmp_path / f"new_{name}").write_bytes(unmarked(before.corrected(found)))
-    after = read_program(tmp_path / f"new_{name}", robot, *frames)
+    (tmp_path / f"new_{name}").write_bytes(unmarked(before.format_corrected(found)))
+    after = read_robot_program(tmp_path / f"new_{name}", robot, *frames)
     assert len(after.points) == 4
     posed = [i for i, point in enumerate(before.points) if point.pose is not None]
     q_old, q_new = before.data.q, after.data.q
@@ -119,12 +119,14 @@ def test_all_else_stays_byte_for_byte(language, fit, robot, tmp_path):
     name, text = ("a.mod", module(robot)) if language == "rapid" else ("a.src", data_list(robot))
     frames = ("tGrip", "wTable") if language == "rapid" else ()
     (tmp_path / name).write_bytes(text.encode("latin-1"))
-    program = read_program(tmp_path / name, robot, *frames)
-    same = program.text.replaced([])
+    program = read_robot_program(tmp_path / name, robot, *frames)
+    same = program.text.replace_numbers([])
     assert same == text
     found = compensate(fit, program.data, robot)
-    made = unmarked(program.corrected(found)).decode("latin-1")
-    spans = [n for p in program.points for n in (*p.place, *p.way)]
+    made = unmarked(program.format_corrected(found)).decode("latin-1")
+    spans = [
+        n for p in program.points for n in (*p.pose_or_joint_numbers, *p.configuration_numbers)
+    ]
     old, new, at_old, at_new = text, made, 0, 0
     for number in sorted(spans, key=lambda n: n.start):
         kept = old[at_old : number.start]
@@ -141,15 +143,15 @@ def test_angles_and_quaternions_stay_near_what_was_there(rng):
     """Through the singular B = 90 degrees, and with the other sign of a quaternion."""
     for b in (90.0, 89.9999, -90.0, 12.0):
         text = f"PTP {{X 1,Y 2,Z 3,A 100,B {b},C -170,S 2,T 2}}"
-        (point,) = krl.points(krl.read(text, "a.src"))
+        (point,) = krl.find_points(krl.parse_program(text, "a.src"))
         assert point.pose is not None
-        numbers = np.array([float(v) for v in krl.numbers_of(point.pose, point)])
+        numbers = np.array([float(v) for v in krl.format_pose_numbers(point.pose, point)])
         again = Rotation.from_euler("ZYX", numbers[3:], degrees=True).as_matrix()
         assert_allclose(again, point.pose[:3, :3], rtol=0, atol=1e-8)
     text = "robtarget p:=[[1,2,3],[-0.5,0.5,-0.5,0.5],[0,0,0,0],[0,0,0,0,0,0]];"
-    (point,) = rapid.points(rapid.read(text, "a.mod"))
+    (point,) = rapid.find_points(rapid.parse_program(text, "a.mod"))
     assert point.pose is not None
-    assert [float(v) for v in rapid.numbers_of(point.pose, point)] == [
+    assert [float(v) for v in rapid.format_pose_numbers(point.pose, point)] == [
         1,
         2,
         3,
@@ -162,13 +164,15 @@ def test_angles_and_quaternions_stay_near_what_was_there(rng):
 
 def test_a_quarter_turn_that_changed_is_told():
     text = "robtarget p:=[[1,2,3],[1,0,0,0],[0,-1,0,1],[0,0,0,0,0,0]];"
-    (point,) = rapid.points(rapid.read(text, "a.mod"))
+    (point,) = rapid.find_points(rapid.parse_program(text, "a.mod"))
     before, after = np.array([1e-4, 0, 0, -0.1, 0, 0.3]), np.array([-1e-4, 0, 0, -0.1, 0, 0.3])
-    assert rapid.stands(point, before)
-    assert [(n.value, new) for n, new in rapid.ways(point, before, after)] == [(0.0, "-1")]
-    (point,) = krl.points(krl.read("PTP {X 1,Y 2,Z 3,A 0,B 0,C 0,S 2,T 8}", "a.src"))
-    assert krl.stands(point, before)
-    assert [new for _, new in krl.ways(point, before, after)] == ["9"]
+    assert rapid.has_programmed_configuration(point, before)
+    assert [
+        (n.value, new) for n, new in rapid.list_configuration_changes(point, before, after)
+    ] == [(0.0, "-1")]
+    (point,) = krl.find_points(krl.parse_program("PTP {X 1,Y 2,Z 3,A 0,B 0,C 0,S 2,T 8}", "a.src"))
+    assert krl.has_programmed_configuration(point, before)
+    assert [new for _, new in krl.list_configuration_changes(point, before, after)] == ["9"]
 
 
 @pytest.mark.parametrize(
@@ -208,22 +212,22 @@ def test_frames_that_the_run_writes_are_refused(change, robot, tmp_path):
     text = module(robot).replace("  PROC main()", f"  PROC main()\r\n    {change}")
     (tmp_path / "a.mod").write_bytes(text.encode("latin-1"))
     with pytest.raises(DataError, match=r"a\.mod:10: the program changes (tGrip|wTable)"):
-        read_program(tmp_path / "a.mod", robot, "tGrip", "wTable")
+        read_robot_program(tmp_path / "a.mod", robot, "tGrip", "wTable")
     other = text.replace(change, change.replace("tGrip", "tOther").replace("wTable", "wOther"))
     (tmp_path / "a.mod").write_bytes(other.encode("latin-1"))
-    assert read_program(tmp_path / "a.mod", robot, "tGrip", "wTable").points
+    assert read_robot_program(tmp_path / "a.mod", robot, "tGrip", "wTable").points
 
 
 def test_coordinates_that_the_run_writes_are_said(robot, tmp_path):
     before = "    MoveL p10,"
     text = module(robot).replace(before, f"    IF a=1 p10.trans.z:=p10.trans.z+5;\r\n{before}")
     (tmp_path / "a.mod").write_bytes(text.encode("latin-1"))
-    notices = read_program(tmp_path / "a.mod", robot, "tGrip", "wTable").data.notices
+    notices = read_robot_program(tmp_path / "a.mod", robot, "tGrip", "wTable").data.notices
     assert [n.partition(": ")[2] for n in notices] == [
         "at line 12 the run writes p10.trans.z: what it writes is not corrected"
     ]
     (tmp_path / "a.src").write_text(data_list(robot) + "\nXP0.Z = XP0.Z + 5\n")
-    assert "XP0.Z" in " ".join(read_program(tmp_path / "a.src", robot).data.notices)
+    assert "XP0.Z" in " ".join(read_robot_program(tmp_path / "a.src", robot).data.notices)
 
 
 def test_external_axes_are_said(robot, tmp_path):
@@ -238,12 +242,12 @@ def test_external_axes_are_said(robot, tmp_path):
         for value in values:
             text = text.replace(f"[{none}]", f"[{value},9E9,9E9,9E9,9E9]", 1)
         path.write_bytes(text.encode("latin-1"))
-        notices = " ".join(read_program(path, robot, "tGrip", "wTable").data.notices)
+        notices = " ".join(read_robot_program(path, robot, "tGrip", "wTable").data.notices)
         assert ("external axis" in notices) == bool(said)
         assert said in notices
     (tmp_path / "a.src").write_text(data_list(robot).replace("E1 0.0", "E1 250.0", 1))
     assert "axis E1 stands from 0 to 250;" in " ".join(
-        read_program(tmp_path / "a.src", robot).data.notices
+        read_robot_program(tmp_path / "a.src", robot).data.notices
     )
 
 

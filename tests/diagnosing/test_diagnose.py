@@ -14,57 +14,63 @@ from problems_fit import numbers, study_of
 
 import minimax_cal as mc
 from experiments import machines
-from experiments.gap_cases import Case, Cause, Sealed, make
-from minimax_cal.diagnosing import causes as search
-from minimax_cal.diagnosing.causes import Causes, judge_causes
-from minimax_cal.diagnosing.diagnose import explain_contradiction
-from minimax_cal.diagnosing.established import (
+from experiments.gap_cases import GapCase, GapCause, SealedArm, build_and_measure_arm
+from minimax_cal.core.arrays import Array
+from minimax_cal.diagnosing import cause_search as search
+from minimax_cal.diagnosing.budget_steps import estimate_explained_fraction
+from minimax_cal.diagnosing.cause_search import FoundCauses, judge_causes
+from minimax_cal.diagnosing.confirmation import (
     find_unconfirmed,
     has_frequencies,
     is_mostly_unconfirmed,
-    keys_standing_for,
+    list_equivalent_keys,
     select_frequent,
 )
+from minimax_cal.diagnosing.diagnose import describe_contradiction
+from minimax_cal.diagnosing.diagnosis import VERDICTS, AlternativeEffect, BudgetStep, Finding
+from minimax_cal.diagnosing.diagnosis_sentences import CONTRADICTION_SENTENCE, VERDICT_OPENINGS
 from minimax_cal.diagnosing.findings import add_untestable_alternatives
-from minimax_cal.diagnosing.gap import closed_share
-from minimax_cal.diagnosing.result import VERDICTS, Alternative, Finding, Step
-from minimax_cal.diagnosing.sentences import CONTRADICTED, OPENINGS
-from minimax_cal.diagnosing.study import Study
+from minimax_cal.diagnosing.remaining_error import NO_REMAINING_COMPONENT
+from minimax_cal.diagnosing.study import LinearisedGeometry
 from minimax_cal.diagnosing.verdict import (
-    ABOVE_NOISE,
-    ONLY_MINOR,
-    UNASKED,
-    UNHELPFUL,
-    UNSURE,
-    Known,
-    answered,
-    why_loose,
+    ABOVE_NOISE_TEXT,
+    CHANGING_CAUSES_TEXT,
+    ONLY_MINOR_TEXT,
+    TOO_FEW_POSES_TEXT,
+    UNHELPFUL_CAUSES_TEXT,
+    NoiseLimits,
+    adjust_verdict_to_noise,
+    describe_why_unconfirmed,
 )
-from minimax_cal.diagnosing.what_remains import NOTHING
-from minimax_cal.evidence import limits
-from minimax_cal.evidence.limits import CONFIRMED, FREQUENT, PARTS, ROUNDS, STRUCTURE
-from minimax_cal.evidence.selection import select
-from minimax_cal.evidence.stability import Repeats
 from minimax_cal.fitting.accuracy import Accuracy
-from minimax_cal.fitting.checks import misplaced, put_right
-from minimax_cal.fitting.floor import AT_MOST, REPEATS, Floor
-from minimax_cal.ground.arrays import Array
-from minimax_cal.modelling.cell import Cell, still
-from minimax_cal.modelling.dictionary import arm_library
+from minimax_cal.fitting.data_slips import correct_misplaced_rows, match_misplaced_rows
+from minimax_cal.fitting.noise_floor import AT_MOST, REPEATS, NoiseFloor
+from minimax_cal.modelling.arm_laws import build_arm_library
+from minimax_cal.modelling.cell import Cell, build_measurements_at_rest
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.simulate import Simulation
 from minimax_cal.robots import kinematics
-from minimax_cal.robots.gravity import G, tubes
-from minimax_cal.robots.sampling import random_poses
-from minimax_cal.robots.transforms import transform
+from minimax_cal.robots.gravity_torques import STANDARD_GRAVITY, assumed_link_masses_and_centres
+from minimax_cal.robots.joint_sampling import random_joint_values_above_floor
+from minimax_cal.robots.transforms import build_transform
+from minimax_cal.selection import thresholds
+from minimax_cal.selection.forward_selection import select_effects_by_evidence
+from minimax_cal.selection.stability_selection import SubsampleSelections
+from minimax_cal.selection.thresholds import (
+    MIN_CONFIRMED_FREQUENCY,
+    MIN_MODEL_FREQUENCY,
+    REMAINING_STRUCTURE_P_VALUE,
+    SUBSAMPLE_PART_COUNT,
+    SUBSAMPLE_ROUND_COUNT,
+)
 
 
-def sealed(*causes: Cause, seed: int = 1, condition: str = "single") -> Sealed:
-    return make(Case("irb2600", condition, causes, seed=seed))
+def sealed(*causes: GapCause, seed: int = 1, condition: str = "single") -> SealedArm:
+    return build_and_measure_arm(GapCase("irb2600", condition, causes, seed=seed))
 
 
 @cache
-def diagnosed(*causes: Cause, seed: int = 1) -> mc.Diagnosis:
+def diagnosed(*causes: GapCause, seed: int = 1) -> mc.Diagnosis:
     """What is found on an arm, which is sound without causes."""
     made = sealed(*causes, seed=seed, condition="single" if causes else "none")
     return mc.diagnose(made.robot, made.data, quick=True)
@@ -72,7 +78,7 @@ def diagnosed(*causes: Cause, seed: int = 1) -> mc.Diagnosis:
 
 @pytest.fixture(scope="module")
 def plain() -> mc.Diagnosis:
-    return diagnosed(Cause("backlash", "J2", 1000.0))
+    return diagnosed(GapCause("backlash", "J2", 1000.0))
 
 
 def test_nothing_is_named_on_a_sound_arm() -> None:
@@ -81,24 +87,28 @@ def test_nothing_is_named_on_a_sound_arm() -> None:
     assert found.effects == ()
     assert abs(found.floor.value / (1e3 * made.floor) - 1.0) < 0.1
     assert (found.meets_floor, found.floor_known) == (True, True)
-    assert found.headline().startswith(OPENINGS["none"].removesuffix("."))
+    assert found.headline().startswith(VERDICT_OPENINGS["none"].removesuffix("."))
 
 
 def test_the_gear_of_a_drive_that_moves_two_joints_is_named(rng: np.random.Generator) -> None:
     """Joint 3 turns by q3 - q2, drive 2 winds up by what it carries: minus the energy's slope."""
     arm = mc.load_robot("irb2600")
-    mass, com = tubes(arm.mdh)
+    mass, com = assumed_link_masses_and_centres(arm.mdh)
     linked = np.eye(6) - np.eye(6)[:, 2:3] * np.eye(6)[1]
     robot = replace(arm, mass=mass, com=com, coupling=linked)
     spots = np.array([[0.1, 0.0, 0.05], [-0.05, 0.09, 0.05], [-0.05, -0.08, 0.06]])
-    q, carried = random_poses(robot, 60, rng), rng.choice([0.0, 40.0], 60)
+    q, carried = random_joint_values_above_floor(robot, 60, rng), rng.choice([0.0, 40.0], 60)
 
     def energy(values: Array) -> Array:
         turned, out = values @ linked.T * arm.sign, 0.0
         for i in range(6):
-            last = kinematics.forward(arm.mdh[: i + 1], turned[:, : i + 1], arm.prismatic[: i + 1])
-            out = out + mass[i] * G * (last[:, 2, :3] @ com[i] + last[:, 2, 3])
-        return np.asarray(out + carried * G * (last[:, 2, :3] @ spots.mean(axis=0) + last[:, 2, 3]))
+            last = kinematics.forward_kinematics(
+                arm.mdh[: i + 1], turned[:, : i + 1], arm.prismatic[: i + 1]
+            )
+            out = out + mass[i] * STANDARD_GRAVITY * (last[:, 2, :3] @ com[i] + last[:, 2, 3])
+        return np.asarray(
+            out + carried * STANDARD_GRAVITY * (last[:, 2, :3] @ spots.mean(axis=0) + last[:, 2, 3])
+        )
 
     torque = -energy(q + 1e-30j * np.eye(6)[1]).imag / 1e-30
     pose = robot.pose(q + 2e-6 * np.outer(torque, np.eye(6)[1]))
@@ -139,14 +149,14 @@ def numbers_of(content: object) -> list[float]:
     ("causes", "seed"),
     [
         ((), 1),
-        ((Cause("backlash", "J2", 1000.0),), 1),
-        ((Cause("outside_sum", "J2", 1000.0),), 1),
-        ((Cause("backlash", "J1", 500.0), Cause("gear_error", "J3", 500.0)), 3),
-        ((Cause("outliers", "all", 1.0),), 7),
+        ((GapCause("backlash", "J2", 1000.0),), 1),
+        ((GapCause("outside_sum", "J2", 1000.0),), 1),
+        ((GapCause("backlash", "J1", 500.0), GapCause("gear_error", "J3", 500.0)), 3),
+        ((GapCause("outliers", "all", 1.0),), 7),
     ],
     ids=["none", "one", "outside", "two", "fault"],
 )
-def test_every_number_in_words_stands_in_the_json(causes: tuple[Cause, ...], seed: int) -> None:
+def test_every_number_in_words_stands_in_the_json(causes: tuple[GapCause, ...], seed: int) -> None:
     found = diagnosed(*causes, seed=seed)
     said = json.loads(found.json())
     del said["reasons"]  # the words themselves
@@ -159,21 +169,21 @@ def test_every_number_in_words_stands_in_the_json(causes: tuple[Cause, ...], see
 
 
 def test_an_arm_that_does_not_come_back_is_called_so() -> None:
-    made = make(Case("irb2600", "rough", jitter=200e-6, seed=4))
+    made = build_and_measure_arm(GapCase("irb2600", "rough", jitter=200e-6, seed=4))
     found = mc.diagnose(made.robot, made.data, quick=True)
     assert found.verdict == "not_repeatable"
-    assert OPENINGS["not_repeatable"] in found.headline()
+    assert VERDICT_OPENINGS["not_repeatable"] in found.headline()
 
 
 def test_a_law_outside_the_library_is_unknown() -> None:
-    found = diagnosed(Cause("outside_sum", "J2", 1000.0))
+    found = diagnosed(GapCause("outside_sum", "J2", 1000.0))
     assert found.verdict == "unknown"
-    assert found.structure < STRUCTURE
-    assert OPENINGS["unknown"] in found.headline()
+    assert found.structure < REMAINING_STRUCTURE_P_VALUE
+    assert VERDICT_OPENINGS["unknown"] in found.headline()
 
 
 def test_without_the_true_effect_no_relative_is_named_with_confidence() -> None:
-    made = sealed(Cause("backlash", "J2", 1000.0))
+    made = sealed(GapCause("backlash", "J2", 1000.0))
     found = mc.diagnose(made.robot, made.data, exclude=("backlash",), quick=True)
     assert found.verdict == "unknown" or any(f.alternatives for f in found.effects)
     assert all(f.term.effect != "backlash" for f in found.effects)
@@ -185,7 +195,7 @@ def test_the_ladder_is_of_poses_that_no_fit_has_seen(plain: mc.Diagnosis) -> Non
     error = np.linalg.norm(cell.error(plain.data.take(held)), axis=-1)
     assert_allclose(plain.ladder[-1].holdout.rms_mm, 1e3 * np.sqrt(np.mean(error**2)), rtol=1e-9)
     again = mc.diagnose(
-        sealed(Cause("backlash", "J2", 1000.0)).robot,
+        sealed(GapCause("backlash", "J2", 1000.0)).robot,
         plain.data.with_y(np.where(held[:, None, None], plain.data.y + 5.0, plain.data.y)),
         quick=True,
     )
@@ -197,16 +207,16 @@ def test_the_ladder_is_of_poses_that_no_fit_has_seen(plain: mc.Diagnosis) -> Non
 
 
 def test_outliers_and_swapped_rows_are_named_and_mended() -> None:
-    cause = Cause("outliers", "all", 1.0)
+    cause = GapCause("outliers", "all", 1.0)
     made, found = sealed(cause, seed=7), diagnosed(cause, seed=7)
     assert found.effects[0].term.effect == "outliers"
     last = found.ladder[-1]
     assert last.trusted.rms_mm < 1.1e3 * made.floor * 1.05
     assert last.holdout.rms_mm > 2.0 * last.trusted.rms_mm  # what is held out stays there
-    made = sealed(Cause("swapped_rows", "all", 1.0), seed=7)
+    made = sealed(GapCause("swapped_rows", "all", 1.0), seed=7)
     found = mc.diagnose(made.robot, made.data, quick=True)
     assert found.effects[0].term.effect == "swapped_rows"
-    moved = np.flatnonzero(np.abs(made.displacement).max(axis=(0, 2)) > 0.01)
+    moved = np.flatnonzero(np.abs(made.displacement).max(axis=(1, 2)) > 0.01)
     assert sorted(found.effects[0].rows) == made.data.line[moved].tolist()
     assert found.ladder[-1].trusted.rms_mm < 1.1e3 * made.floor * 1.05
 
@@ -215,28 +225,28 @@ def test_rows_find_their_own_points_again() -> None:
     made = sealed(condition="none", seed=5)
     y = made.data.y.copy()
     y[[3, 8, 20]] = y[[8, 20, 3]]
-    rows, source = misplaced(made.robot, made.data.with_y(y))
+    rows, source = match_misplaced_rows(made.robot, made.data.with_y(y))
     assert rows.tolist() == [3, 8, 20]
-    back = put_right(made.data.with_y(y), rows, source)
+    back = correct_misplaced_rows(made.data.with_y(y), rows, source)
     assert_allclose(back.y, made.data.y, rtol=0, atol=0)
-    assert not len(misplaced(made.robot, made.data)[0])
+    assert not len(match_misplaced_rows(made.robot, made.data)[0])
     y = made.data.y.copy()
     y[4] += 0.5
-    rows, source = misplaced(made.robot, made.data.with_y(y))
+    rows, source = match_misplaced_rows(made.robot, made.data.with_y(y))
     assert (rows.tolist(), source.tolist()) == ([4], [4])
-    assert put_right(made.data.with_y(y), rows, source).poses == made.data.poses - 1
+    assert correct_misplaced_rows(made.data.with_y(y), rows, source).poses == made.data.poses - 1
 
 
 def test_closed_share_is_of_squares_above_the_floor() -> None:
     rng = np.random.default_rng(0)
     before, after = (s * rng.normal(size=(4000, 3, 3)) for s in (2e-3, 1e-3))
-    floor, group = Floor(np.sqrt(3.0) * 0.5, 0.8, 0.9, REPEATS), np.arange(4000)
-    share, (low, high) = closed_share(before, after, group, floor, 0.0, rng)
+    floor, group = NoiseFloor(np.sqrt(3.0) * 0.5, 0.8, 0.9, REPEATS), np.arange(4000)
+    share, (low, high) = estimate_explained_fraction(before, after, group, floor, 0.0, rng)
     assert abs(share - (4.0 - 1.0) / (4.0 - 0.25)) < 0.02
     assert low < share < high
-    _, (lower, higher) = closed_share(before, after, group, floor, 0.01, rng)
+    _, (lower, higher) = estimate_explained_fraction(before, after, group, floor, 0.01, rng)
     assert higher - lower > 5.0 * (high - low)  # other training poses would have changed it
-    none = closed_share(before * 0.0, before * 0.0, group, floor, 0.0, rng)
+    none = estimate_explained_fraction(before * 0.0, before * 0.0, group, floor, 0.0, rng)
     assert np.isnan(none[0])
 
 
@@ -259,7 +269,7 @@ def test_user_errors_say_what_to_do(robot: mc.Robot) -> None:
 
 
 def test_one_target_is_enough() -> None:
-    made = sealed(Cause("encoder_gain", "J1", 2000.0), seed=2)
+    made = sealed(GapCause("encoder_gain", "J1", 2000.0), seed=2)
     alone = made.data.only(0)
     found = mc.diagnose(made.robot, alone, quick=True)
     assert found.verdict in VERDICTS
@@ -341,7 +351,9 @@ def test_another_robots_file_is_said() -> None:
 
 def test_the_whole_law_is_told_and_a_point_that_the_gap_hid() -> None:
     """A gear that errs by far more than what is left, and a held-out pose off by less than that."""
-    made = make(Case("irb2600", "single", (Cause("gear_error", "J3", 5e4),), seed=3))
+    made = build_and_measure_arm(
+        GapCase("irb2600", "single", (GapCause("gear_error", "J3", 5e4),), seed=3)
+    )
     bare = mc.diagnose(made.robot, made.data, quick=True)
     held, size = bare.data.line[bare.held], [step.holdout.rms_mm for step in bare.ladder[1:]]
     assert size[0] > 6.0 * size[-1]
@@ -380,10 +392,10 @@ def test_it_ends_with_one_and_writes_no_robot(
     assert not out.exists()
     found = mc.Diagnosis.from_dict(json.loads(said.out))
     assert (found.status, found.verdict) == ("failed", "unknown")
-    gone = replace(found.cells[0], base=transform(np.eye(3), np.array([3e5, 0.0, 0.0])))
+    gone = replace(found.cells[0], base=build_transform(np.eye(3), np.array([3e5, 0.0, 0.0])))
     again = mc.Diagnosis.from_dict(json.loads(replace(found, cells=(gone,)).json()))
     assert_allclose(again.cells[0].base, gone.base, rtol=1e-9)  # wherever it ended
-    assert found.headline() == CONTRADICTED
+    assert found.headline() == CONTRADICTION_SENTENCE
     assert found.verdict == "unknown"
     with pytest.raises(mc.OptionError, match="contradicts its own data"):
         mc.export(found, "json")
@@ -393,15 +405,15 @@ def test_points_that_are_suspect_contradict_nothing(robot: mc.Robot) -> None:
     def scores(rms: float, points: int) -> Accuracy:
         return Accuracy(rms, rms, rms, points, (points * rms**2,), (points,))
 
-    fits, open_end = scores(0.1, 80), Floor(0.1, 0.0, 0.1, AT_MOST)
-    few_bad = Step("geometric", fits, scores(90.0, 20), scores(0.1, 16))
-    assert explain_contradiction(robot, open_end, few_bad) == ""
-    most_bad = Step("geometric", fits, scores(90.0, 20), scores(0.1, 8))
-    assert 90.0 in numbers(explain_contradiction(robot, open_end, most_bad))
-    known = Floor(0.1, 0.1, 0.1, REPEATS)
-    off = Step("geometric", scores(5.5, 80), fits, fits)
-    assert 50.0 in numbers(explain_contradiction(robot, known, off))
-    assert explain_contradiction(robot, open_end, off) == ""
+    fits, open_end = scores(0.1, 80), NoiseFloor(0.1, 0.0, 0.1, AT_MOST)
+    few_bad = BudgetStep("geometric", fits, scores(90.0, 20), scores(0.1, 16))
+    assert describe_contradiction(robot, open_end, few_bad) == ""
+    most_bad = BudgetStep("geometric", fits, scores(90.0, 20), scores(0.1, 8))
+    assert 90.0 in numbers(describe_contradiction(robot, open_end, most_bad))
+    known = NoiseFloor(0.1, 0.1, 0.1, REPEATS)
+    off = BudgetStep("geometric", scores(5.5, 80), fits, fits)
+    assert 50.0 in numbers(describe_contradiction(robot, known, off))
+    assert describe_contradiction(robot, open_end, off) == ""
 
 
 def test_an_arm_that_comes_back_well_may_bend(robot: mc.Robot) -> None:
@@ -411,15 +423,15 @@ def test_an_arm_that_comes_back_well_may_bend(robot: mc.Robot) -> None:
     twice = made.data.take(np.repeat(np.arange(100), 2))
     twice = twice.with_y(twice.y + 2e-6 * rng.normal(size=twice.y.shape))
     assert mc.calibrate(robot, twice, objective="sum").status == "converged"
-    exact = Floor(0.002, 0.002, 0.002, REPEATS)
+    exact = NoiseFloor(0.002, 0.002, 0.002, REPEATS)
 
-    def step(share: float) -> Step:
+    def step(share: float) -> BudgetStep:
         rms = 1e3 * share * robot.reach()
         one = Accuracy(rms, rms, rms, 80, (80 * rms**2,), (80,))
-        return Step("geometric", one, one, one)
+        return BudgetStep("geometric", one, one, one)
 
-    assert explain_contradiction(robot, exact, step(0.9e-3)) == ""
-    assert 0.1 in numbers(explain_contradiction(robot, exact, step(1.1e-3)))
+    assert describe_contradiction(robot, exact, step(0.9e-3)) == ""
+    assert 0.1 in numbers(describe_contradiction(robot, exact, step(1.1e-3)))
 
 
 # ---- established ---------------------------------------------------------------------------------
@@ -434,13 +446,13 @@ def named(*names: tuple[str, str]) -> frozenset[tuple[str, str]]:
 
 
 def test_the_frequency_decides_what_is_established_and_what_is_in_the_model() -> None:
-    count = PARTS * ROUNDS
+    count = SUBSAMPLE_PART_COUNT * SUBSAMPLE_ROUND_COUNT
     for times in range(count + 1):
         one = replace(cause("backlash", "J1"), again=times / count)
         assert one.established == (times >= count - 1)
         assert (select_frequent([one]) == [one]) == (times >= 8)
         assert one.evidence.endswith(f", {times / count:.2f}")
-    assert FREQUENT < CONFIRMED < (count - 1) / count
+    assert MIN_MODEL_FREQUENCY < MIN_CONFIRMED_FREQUENCY < (count - 1) / count
     unasked = replace(cause("backlash", "J1"), again=float("nan"))
     assert select_frequent([unasked]) == [unasked]
     assert not has_frequencies([unasked])
@@ -449,37 +461,43 @@ def test_the_frequency_decides_what_is_established_and_what_is_in_the_model() ->
 
 
 def test_one_joint_and_all_of_them_stand_for_each_other() -> None:
-    rival = Alternative("base_flex", "frame", 0.9, 5.0, 1.0)
+    rival = AlternativeEffect("base_flex", "frame", 0.9, 5.0, 1.0)
     one = replace(cause("joint_compliance", "J2"), alternatives=(rival,))
-    repeats = Repeats(
+    repeats = SubsampleSelections(
         (named(("joint_compliance", "all")), named(("joint_compliance", "J3"), ("backlash", "J1"))),
         2,
     )  # fmt: skip
-    assert keys_standing_for(one, repeats) == {
+    assert list_equivalent_keys(one, repeats) == {
         ("joint_compliance", "J2"), ("joint_compliance", "all"), ("base_flex", "frame")
     }  # fmt: skip
     every = replace(one, terms=(Term("joint_compliance", "all"),), alternatives=())
-    assert keys_standing_for(every, repeats) == {
+    assert list_equivalent_keys(every, repeats) == {
         ("joint_compliance", "J3"), ("joint_compliance", "all")
     }  # fmt: skip
 
 
 @pytest.fixture(scope="module")
-def geared() -> tuple[Study, Causes]:
-    study = study_of(make(Case("irb2600", "single", (Cause("gear_error", "J1", 300.0),), seed=4)))
-    choice = select(arm_library(study.scene, study.rows))
-    return study, Causes((), (), choice, (), (NOTHING,), ())
+def geared() -> tuple[LinearisedGeometry, FoundCauses]:
+    study = study_of(
+        build_and_measure_arm(
+            GapCase("irb2600", "single", (GapCause("gear_error", "J1", 300.0),), seed=4)
+        )
+    )
+    choice = select_effects_by_evidence(build_arm_library(study.scene, study.rows))
+    return study, FoundCauses((), (), choice, (), (NO_REMAINING_COMPONENT,), ())
 
 
 def test_what_takes_the_place_of_a_name_is_its_alternative(
-    geared: tuple[Study, Causes], monkeypatch: pytest.MonkeyPatch
+    geared: tuple[LinearisedGeometry, FoundCauses], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     study, causes = geared
-    (own,) = (named(candidate.key) for candidate in causes.choice.chosen)
+    (own,) = (named(candidate.key) for candidate in causes.selection.candidates)
     gain, play, other = ("encoder_gain", "J1"), ("backlash", "J6"), ("no such", "J1")
     found = (own, own, own, named(gain, other), named(gain, other), named(play))
-    monkeypatch.setattr(search, "repeated", lambda *args, **options: Repeats(found, 6))
-    (told,) = judge_causes(study.scene, causes, study.rows.group).effects
+    monkeypatch.setattr(
+        search, "select_on_subsamples", lambda *args, **options: SubsampleSelections(found, 6)
+    )
+    (told,) = judge_causes(study.scene, causes, study.rows.row_groups).effects
     assert told.again == 5 / 6  # it, or what takes its place
     assert [(a.effect, a.place) for a in told.alternatives] == [gain]
     assert told.alternatives[0].loss > 0.0
@@ -488,8 +506,8 @@ def test_what_takes_the_place_of_a_name_is_its_alternative(
 
 def test_poses_too_few_to_ask_leave_an_effect_possible_below_the_budget() -> None:
     """Twenty poses of one target: two thirds of them tell the geometry and little more."""
-    made = make(
-        Case("irb2600", "single", (Cause("joint_compliance", "J2", 2e4),), seed=3, poses=20)
+    made = build_and_measure_arm(
+        GapCase("irb2600", "single", (GapCause("joint_compliance", "J2", 2e4),), seed=3, poses=20)
     )
     data = made.data.keep(np.arange(len(made.data.target_names)) == 0).take(np.arange(20))
     columns = {name: column for name, column in data.columns.items() if name != "split"}
@@ -513,11 +531,11 @@ def finding(effect: str, place: str, size: float = 100.0, again: float = 1.0) ->
 
 def test_a_name_that_helps_at_no_poses_left_out_holds_nothing() -> None:
     firm, weak = finding("gear_error", "J3"), finding("encoder_gain", "J2", 50.0, again=0.6)
-    chance = replace(finding("backlash", "J1"), p_value=10.0 * limits.CERTAIN)
+    chance = replace(finding("backlash", "J1"), p_value=10.0 * thresholds.CERTAIN_P_VALUE)
     every = [firm, weak, chance]
     assert find_unconfirmed(every, [firm]) == [weak]
     assert find_unconfirmed(every, []) == [firm, weak]  # the ladder refused the first
-    rival = Alternative("gear_error", "all", 0.9, 5.0, 1.0, "")
+    rival = AlternativeEffect("gear_error", "all", 0.9, 5.0, 1.0, "")
     for other in (finding("gear_error", "all"), finding("backlash", "J3")):
         assert find_unconfirmed([firm, other], [firm]) == [other][: other.term.effect == "backlash"]
     bending = replace(finding("link_bending", "L3"), alternatives=(rival,))
@@ -526,17 +544,19 @@ def test_a_name_that_helps_at_no_poses_left_out_holds_nothing() -> None:
     assert not is_mostly_unconfirmed(every, [firm])
     assert is_mostly_unconfirmed(every, [])
     assert is_mostly_unconfirmed([firm, replace(weak, size=300.0)], [firm])
-    assert why_loose(every, [weak]) == UNSURE
-    assert why_loose(every, [firm, weak]) == UNHELPFUL
-    assert why_loose(every, [firm, replace(weak, size=300.0)]) == UNSURE  # most of it changes
+    assert describe_why_unconfirmed(every, [weak]) == CHANGING_CAUSES_TEXT
+    assert describe_why_unconfirmed(every, [firm, weak]) == UNHELPFUL_CAUSES_TEXT
+    assert (
+        describe_why_unconfirmed(every, [firm, replace(weak, size=300.0)]) == CHANGING_CAUSES_TEXT
+    )  # most of it changes
     few = [replace(one, again=float("nan")) for one in every]
-    assert why_loose(few, find_unconfirmed(few, [])) == UNASKED
+    assert describe_why_unconfirmed(few, find_unconfirmed(few, [])) == TOO_FEW_POSES_TEXT
 
 
 @pytest.fixture(scope="module")
 def two_orders() -> mc.Diagnosis:
-    causes = (Cause("gear_error", "J3", 300.0, 0), Cause("gear_error", "J3", 300.0, 1))
-    made = make(Case("irb2600", "single", causes, seed=3))
+    causes = (GapCause("gear_error", "J3", 300.0, 0), GapCause("gear_error", "J3", 300.0, 1))
+    made = build_and_measure_arm(GapCase("irb2600", "single", causes, seed=3))
     return mc.diagnose(made.robot, made.data, quick=True)
 
 
@@ -592,8 +612,10 @@ def test_what_could_not_be_tested_stands_among_the_alternatives_of_its_relatives
     """Without masses a joint that yields to its own load may yield to its neighbour's."""
     robot = mc.load_robot("irb2600")
     bare = Cell(robot, np.eye(4), ("smr1",), np.full((1, 3), 0.1))
-    scene = bare.scene(still(np.linspace(-1.0, 1.0, 60).reshape(10, 6), ("smr1",), robot))
-    assert not scene.known_masses
+    scene = bare.pose_arm(
+        build_measurements_at_rest(np.linspace(-1.0, 1.0, 60).reshape(10, 6), ("smr1",), robot)
+    )
+    assert not scene.has_known_masses
     (rival,) = add_untestable_alternatives(
         finding("joint_compliance", "J2"), scene, ()
     ).alternatives
@@ -604,7 +626,7 @@ def test_what_could_not_be_tested_stands_among_the_alternatives_of_its_relatives
     ).alternatives
     assert not add_untestable_alternatives(finding("gear_error", "J2"), scene, ()).alternatives
     heavy = replace(robot, mass=np.full(6, 5.0), com=np.zeros((6, 3)))
-    told = replace(bare, robot=heavy).scene(scene.data)
+    told = replace(bare, robot=heavy).pose_arm(scene.data)
     assert not add_untestable_alternatives(finding("joint_compliance", "J2"), told, ()).alternatives
 
 
@@ -612,16 +634,23 @@ def test_what_could_not_be_tested_stands_among_the_alternatives_of_its_relatives
 
 
 NAN = float("nan")
-QUIET = Known(highest=0.05, remaining=0.04, visits=NAN, expected=NAN)
-LOUD = replace(QUIET, remaining=0.14)
-UNKNOWN = replace(LOUD, highest=NAN)
+QUIET = NoiseLimits(
+    highest_noise_mm=0.05,
+    lowest_error_mm=0.04,
+    lowest_visit_scatter_mm=NAN,
+    expected_scatter_mm=NAN,
+)
+LOUD = replace(QUIET, lowest_error_mm=0.14)
+UNKNOWN = replace(LOUD, highest_noise_mm=NAN)
 
 
 @pytest.mark.parametrize(
     ("known", "meets"), [(QUIET, True), (LOUD, False), (UNKNOWN, None)], ids=str
 )
-def test_a_model_meets_the_noise_where_that_is_known(known: Known, meets: bool | None) -> None:
-    assert known.meets_floor is meets
+def test_a_model_meets_the_noise_where_that_is_known(
+    known: NoiseLimits, meets: bool | None
+) -> None:
+    assert known.is_down_to_noise is meets
 
 
 @pytest.mark.parametrize(
@@ -636,9 +665,9 @@ def test_a_model_meets_the_noise_where_that_is_known(known: Known, meets: bool |
         ("unknown", QUIET, "unknown"),
     ],
 )
-def test_the_verdict_reads_the_noise(verdict: str, known: Known, expected: str) -> None:
+def test_the_verdict_reads_the_noise(verdict: str, known: NoiseLimits, expected: str) -> None:
     found = [sure(minor=False)] if verdict == "named" else []
-    assert answered(verdict, "", found, known)[0] == expected
+    assert adjust_verdict_to_noise(verdict, "", found, known)[0] == expected
 
 
 def sure(*, minor: bool) -> Finding:
@@ -649,31 +678,36 @@ def sure(*, minor: bool) -> Finding:
 @pytest.mark.parametrize(
     ("known", "expected"), [(QUIET, "none"), (UNKNOWN, "none"), (LOUD, "unknown")]
 )
-def test_minor_causes_alone_carry_no_verdict(known: Known, expected: str) -> None:
-    verdict, why = answered("named", "", [sure(minor=True)], known)
+def test_minor_causes_alone_carry_no_verdict(known: NoiseLimits, expected: str) -> None:
+    verdict, why = adjust_verdict_to_noise("named", "", [sure(minor=True)], known)
     assert verdict == expected
-    assert (why == ONLY_MINOR) == (expected == "unknown")
+    assert (why == ONLY_MINOR_TEXT) == (expected == "unknown")
 
 
 def test_a_cause_that_carries_the_error_is_no_answer_to_noise_that_is_known() -> None:
-    assert answered("named", "", [sure(minor=False)], LOUD) == ("unknown", ABOVE_NOISE)
-    assert answered("one_of", "", [sure(minor=False)], QUIET) == ("one_of", "")
+    assert adjust_verdict_to_noise("named", "", [sure(minor=False)], LOUD) == (
+        "unknown",
+        ABOVE_NOISE_TEXT,
+    )
+    assert adjust_verdict_to_noise("one_of", "", [sure(minor=False)], QUIET) == ("one_of", "")
 
 
 @pytest.mark.parametrize(("visits", "repeatable"), [(0.1, True), (0.2, False), (NAN, True)])
 def test_an_arm_is_not_repeatable_whose_visits_scatter_more_than_it_may(
     visits: float, repeatable: bool
 ) -> None:
-    known = replace(QUIET, visits=visits, expected=0.1)
+    known = replace(QUIET, lowest_visit_scatter_mm=visits, expected_scatter_mm=0.1)
     assert known.is_repeatable == repeatable
     expected = "none" if repeatable else "not_repeatable"
-    assert answered("none", "", [], known)[0] == expected
+    assert adjust_verdict_to_noise("none", "", [], known)[0] == expected
 
 
 def test_a_joint_on_two_seats_is_not_repeatable() -> None:
     """By its visits, beside what the distances between the targets say of the instrument."""
-    made = machines.make(
-        machines.Asked("ur5e", "mechanism", (Cause("outside_seats", "J2", 5000.0),), seed=5)
+    made = machines.build_and_measure_arm(
+        machines.MachineCase(
+            "ur5e", "mechanism", (GapCause("outside_seats", "J2", 5000.0),), seed=5
+        )
     )
     found = mc.diagnose(made.robot, made.data, quick=True)
     assert found.verdict == "not_repeatable"

@@ -10,9 +10,9 @@ from conftest import run
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import OptionError
-from minimax_cal.modelling.effects import EFFECTS, Columns, Effect, Scene, Term, register
+from minimax_cal.core.arrays import Array
+from minimax_cal.core.errors import OptionError
+from minimax_cal.modelling.effects import EFFECTS, Effect, EffectColumns, PosedArm, Term, register
 from minimax_cal.modelling.effects.scene import Choice, one_joint
 from minimax_cal.modelling.effects.table import Fitted
 from minimax_cal.modelling.simulate import Truth, simulate
@@ -20,23 +20,23 @@ from minimax_cal.modelling.simulate import Truth, simulate
 PULL, SWAY = 8e-5, 1e-3
 
 
-def wound(scene: Scene) -> Array:
+def wound(scene: PosedArm) -> Array:
     return np.asarray(scene.q[3] + scene.q[5])
 
 
-def pull(scene: Scene, place: str, choice: Choice) -> Columns:
-    return Columns(("k",), ("1/rad",), turn=one_joint(scene, 4, wound(scene)[None] ** 2))
+def pull(scene: PosedArm, place: str, choice: Choice) -> EffectColumns:
+    return EffectColumns(("k",), ("1/rad",), turn=one_joint(scene, 4, wound(scene)[None] ** 2))
 
 
-def hose(scene: Scene, joint: int, choice: Choice) -> tuple[str, Array]:
+def hose(scene: PosedArm, joint: int, choice: Choice) -> tuple[str, Array]:
     return "hose wound up (deg)", np.degrees(wound(scene))
 
 
-def sway(scene: Scene, place: str, choice: Choice) -> Columns:
+def sway(scene: PosedArm, place: str, choice: Choice) -> EffectColumns:
     """The tracker's mast leans as the arm turns towards it."""
     shift = np.zeros((1, *scene.points.shape))
     shift[0, :, 0] = np.cos(2.0 * scene.q[0])
-    return Columns(("s",), ("m",), shift=shift)
+    return EffectColumns(("s",), ("m",), shift=shift)
 
 
 HOSE = Effect(

@@ -14,52 +14,57 @@ from numpy.testing import assert_allclose, assert_array_equal
 from problems_fit import numbers
 
 import minimax_cal as mc
-from minimax_cal.diagnosing.curves import (
-    Curve,
-    Leftover,
-    guilty,
-    joint_equivalent,
-    order_curve,
-    residual_curve,
-    turns,
-    without,
-)
-from minimax_cal.diagnosing.proposals import REVISIT
-from minimax_cal.diagnosing.result import (
-    SHOWN_LINES,
-    TOLD_AS,
+from minimax_cal.core.arrays import Array
+from minimax_cal.diagnosing.diagnosis import (
+    MAX_SHOWN_FAULT_LINES,
+    MOTION_UNITS_WITHOUT_MASSES,
     VERDICTS,
-    Alternative,
-    Dependence,
+    AlternativeEffect,
+    BudgetStep,
     Diagnosis,
+    DriverDependence,
     Finding,
-    Remaining,
-    Step,
-    Untestable,
+    RemainingError,
+    UntestableEffect,
 )
-from minimax_cal.diagnosing.sentences import NOT_VISITED, OPENINGS, closed_words, together
-from minimax_cal.evidence.limits import ENOUGH, LEVEL
+from minimax_cal.diagnosing.diagnosis_sentences import (
+    UNKNOWN_REPEATABILITY_TEXT,
+    VERDICT_OPENINGS,
+    describe_explained_fraction,
+    join_places,
+)
+from minimax_cal.diagnosing.proposals import REVISIT_PROPOSAL
+from minimax_cal.diagnosing.residual_curves import (
+    ResidualCurve,
+    ResidualViews,
+    build_residual_curve,
+    build_visit_order_curve,
+    drop_effect,
+    equivalent_joint_rotations,
+    fit_equivalent_rotations,
+    select_shown_joint,
+)
 from minimax_cal.fitting.accuracy import Accuracy
-from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.fit import Provenance
-from minimax_cal.fitting.floor import AT_MOST, DECLARED, DISTANCES, REPEATS, Floor
-from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.history import with_history
-from minimax_cal.modelling.effects import drivers
-from minimax_cal.modelling.effects.drivers import own_value
-from minimax_cal.modelling.effects.table import NOTHING, Fitted, Term
-from minimax_cal.modelling.effects.words import (
-    name_chance,
-    name_effect,
-    name_place,
-    name_step,
-    name_structure,
+from minimax_cal.fitting.noise_floor import AT_MOST, DECLARED, DISTANCES, REPEATS, NoiseFloor
+from minimax_cal.fitting.region_holdout import RegionHoldout
+from minimax_cal.measuring.visit_history import add_history_columns
+from minimax_cal.modelling.effects import curve_axes
+from minimax_cal.modelling.effects.curve_axes import joint_value_axis
+from minimax_cal.modelling.effects.effect_names import (
+    format_budget_step,
+    format_effect,
+    format_p_value,
+    format_place,
+    format_remaining_structure,
 )
+from minimax_cal.modelling.effects.table import NO_EFFECTS, Fitted, Term
 from minimax_cal.modelling.simulate import simulate
-from minimax_cal.reporting.tables import remaining_table
-from minimax_cal.robots.gravity import masses_of
-from minimax_cal.robots.kinematics import rotation
-from minimax_cal.robots.sampling import random_poses
+from minimax_cal.reporting.diagnosis_tables import build_remaining_error_table
+from minimax_cal.robots.gravity_torques import link_masses_and_centres
+from minimax_cal.robots.joint_sampling import random_joint_values_above_floor
+from minimax_cal.robots.kinematics import rotation_from_vector
+from minimax_cal.selection.thresholds import FALSE_NAME_PROBABILITY, SUFFICIENT_SEPARATION_POWER
 from minimax_cal.solvers.status import Status
 
 PLAY, SOFT = Term("backlash", "J2"), Term("joint_compliance", "J3", {"parts": 128.0})
@@ -69,8 +74,8 @@ def scores(rms: float) -> Accuracy:
     return Accuracy(rms, 2.0 * rms, 0.9 * rms, 20, (20.0 * rms**2,), (20,))
 
 
-def rung(name: str, train: float) -> Step:
-    return Step(name, scores(train), scores(1.1 * train), scores(1.05 * train))
+def rung(name: str, train: float) -> BudgetStep:
+    return BudgetStep(name, scores(train), scores(1.1 * train), scores(1.05 * train))
 
 
 RUNGS = (rung("nominal", 3.0), rung("calibrated geometry", 1.0), rung("+ backlash J2", 0.8),
@@ -97,12 +102,31 @@ def made() -> Diagnosis:
              replace(base, effects=Fitted((PLAY, SOFT), (play, soft)))]  # fmt: skip
     error = np.zeros((30, 2, 3))
     return Diagnosis(
-        "arm", RUNGS, Floor(0.1, 0.05, 0.2, DECLARED), 0.9, (0.8, 0.95), Beyond(), 2e-5, {},
-        ("a notice",), Provenance("arm"), 1.5, sim.data, np.arange(30) % 5 == 0, tuple(cells),
-        stated_errors=(error + 1e-3, error + 5e-4), stated_curves={}, nominal=base,
-        status=Status.CONVERGED, verdict="named", effects=FINDINGS, jitter=4e-6, structure=0.25,
-        structure_in="pose", not_testable=(Untestable("thermal", "temperatures"),),
-    )  # fmt: skip
+        "arm",
+        RUNGS,
+        NoiseFloor(0.1, 0.05, 0.2, DECLARED),
+        0.9,
+        (0.8, 0.95),
+        RegionHoldout(),
+        2e-5,
+        {},
+        ("a notice",),
+        Provenance("arm"),
+        1.5,
+        sim.data,
+        np.arange(30) % 5 == 0,
+        tuple(cells),
+        stated_errors=(error + 1e-3, error + 5e-4),
+        stated_curves={},
+        nominal=base,
+        status=Status.CONVERGED,
+        verdict="named",
+        effects=FINDINGS,
+        jitter=4e-6,
+        structure=0.25,
+        structure_in="pose",
+        not_testable=(UntestableEffect("thermal", "temperatures"),),
+    )
 
 
 # ---- a finding ---------------------------------------------------------------------------------
@@ -113,27 +137,30 @@ def made() -> Diagnosis:
     [
         (0, ""),
         (1, " (line 7)"),
-        (SHOWN_LINES, " (line 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18)"),
-        (SHOWN_LINES + 2, " (line 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18 and 2 more)"),
+        (MAX_SHOWN_FAULT_LINES, " (line 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18)"),
+        (
+            MAX_SHOWN_FAULT_LINES + 2,
+            " (line 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18 and 2 more)",
+        ),
     ],
 )
 def test_a_dozen_lines_are_told_one_by_one(made: Diagnosis, count: int, text: str) -> None:
     found = replace(FINDINGS[2], rows=tuple(range(7, 7 + count)))
-    assert found.points(made.data) == text
+    assert found.describe_fault_points(made.data) == text
 
 
 def test_points_go_by_the_names_of_the_file(made: Diagnosis) -> None:
     names = np.array([f"P{200 + i}" for i in range(made.data.poses)], dtype=object)
     named = replace(made.data, columns={**made.data.columns, "pose": names})
     found = replace(FINDINGS[2], rows=tuple(int(line) for line in named.line[:2]))
-    assert re.findall(r"P\d+", found.points(named)) == ["P200", "P201"]
+    assert re.findall(r"P\d+", found.describe_fault_points(named)) == ["P200", "P201"]
 
 
 @pytest.mark.parametrize(
     ("p", "text"), [(0.0123, "0.01"), (1e-15, "1e-15"), (9e-16, "< 1e-15"), (math.nan, "-")]
 )
 def test_a_chance_too_small_to_matter_is_not_told(p: float, text: str) -> None:
-    assert replace(FINDINGS[0], p_value=p).chance == text
+    assert replace(FINDINGS[0], p_value=p).p_value_text == text
 
 
 def test_it_is_established_if_every_part_finds_it_again() -> None:
@@ -147,10 +174,10 @@ def test_parameters_are_told_in_units_of_files() -> None:
     assert (fault["value"], fault["sigma"], fault["unit"]) == (2.0, None, "mm")
     assumed = replace(FINDINGS[0], motion=(200.0,)).parameters[0]
     assert_allclose([assumed["value"], assumed["sigma"]], [0.4, 0.02])
-    assert assumed["unit"] == TOLD_AS["rad/(N m)"]
+    assert assumed["unit"] == MOTION_UNITS_WITHOUT_MASSES["rad/(N m)"]
     bent = replace(FINDINGS[0], units=("1/(N m^2)",), motion=(50.0,)).parameters[0]
     assert_allclose(bent["value"], 0.1)
-    assert bent["unit"] == TOLD_AS["1/(N m^2)"]
+    assert bent["unit"] == MOTION_UNITS_WITHOUT_MASSES["1/(N m^2)"]
 
 
 def test_an_error_map_is_told_in_two_numbers() -> None:
@@ -169,10 +196,12 @@ def test_an_error_map_is_told_in_two_numbers() -> None:
 
 
 def test_an_alternative_helps_if_a_measurement_tells_it_apart() -> None:
-    other = Alternative("gear_error", "J2", 0.9, 12.0, 3.0, "20 poses")
-    assert other.helps
-    assert not replace(other, separate_with="").helps
-    assert not replace(other, separate_with="no measurement considered would").helps
+    other = AlternativeEffect("gear_error", "J2", 0.9, 12.0, 3.0, "20 poses")
+    assert other.has_helpful_measurement
+    assert not replace(other, separate_with="").has_helpful_measurement
+    assert not replace(
+        other, separate_with="no measurement considered would"
+    ).has_helpful_measurement
 
 
 @pytest.mark.parametrize(
@@ -181,18 +210,18 @@ def test_an_alternative_helps_if_a_measurement_tells_it_apart() -> None:
      ("smr1", "at smr1"), ("T1", "at T1")],
 )  # fmt: skip
 def test_places_in_words(place: str, words: str) -> None:
-    assert name_place(place) == words
+    assert format_place(place) == words
 
 
 def test_all_targets_are_not_the_whole_arm() -> None:
-    assert name_place("all", "outliers") == name_place("all", "target_reseat")
-    assert name_place("all", "joint_compliance") not in ("", name_place("all", "outliers"))
-    assert name_place("smr1", "outliers") == "at smr1"
+    assert format_place("all", "outliers") == format_place("all", "target_reseat")
+    assert format_place("all", "joint_compliance") not in ("", format_place("all", "outliers"))
+    assert format_place("smr1", "outliers") == "at smr1"
 
 
 def test_results_are_themselves_and_stay_so(made: Diagnosis) -> None:
     """Their arrays would not compare."""
-    other = Alternative("gear_error", "J2", 0.9, 12.0, 3.0)
+    other = AlternativeEffect("gear_error", "J2", 0.9, 12.0, 3.0)
     assert len({made, replace(made), *FINDINGS, replace(FINDINGS[0])}) == len(FINDINGS) + 3
     for one, name in ((made, "verdict"), (FINDINGS[0], "share"), (RUNGS[0], "name"),
                       (other, "effect")):  # fmt: skip
@@ -228,7 +257,7 @@ def test_the_file_holds_every_number(made: Diagnosis) -> None:
     assert soft["holdout_rms_mm"] == {"before": 0.84, "after": 0.5}
     assert (fault["lines"], fault["holdout_rms_mm"]["after"]) == ([3, 5], None)
     assert [len(cell["effects"]) for cell in said["cells"]] == [0, 2]
-    steps = [finding.term.step for finding in (FINDINGS[1], FINDINGS[0])]
+    steps = [finding.term.budget_step_name for finding in (FINDINGS[1], FINDINGS[0])]
     assert [row["name"] for row in said["rungs"]] == ["nominal", "geometric", *steps]
     assert len(said["poses"]["line"]) == 30
     assert replace(made, nominal=None).rungs() == ()
@@ -238,8 +267,8 @@ def test_an_interval_that_says_nothing_is_null(made: Diagnosis) -> None:
     unsure = replace(made, closed_ci=(math.nan, math.nan))
     said = json.loads(unsure.json())
     assert said["gap"]["closed_ci95"] is None
-    assert numbers(closed_words(made)) == [90.0, 95.0, 80.0, 95.0]
-    assert numbers(closed_words(unsure)) == [90.0]
+    assert numbers(describe_explained_fraction(made)) == [90.0, 95.0, 80.0, 95.0]
+    assert numbers(describe_explained_fraction(unsure)) == [90.0]
     assert not Diagnosis.from_dict(said).has_interval
 
 
@@ -258,16 +287,20 @@ def test_errors_and_curves_are_those_of_the_cells(made: Diagnosis) -> None:
 
 
 def test_findings_stand_in_the_order_of_the_ladder(made: Diagnosis) -> None:
-    assert [f.term.effect for f in made.by_rung] == ["outliers", "joint_compliance", "backlash"]
+    assert [f.term.effect for f in made.findings_in_step_order] == [
+        "outliers",
+        "joint_compliance",
+        "backlash",
+    ]
 
 
 def test_the_tables_hold_the_numbers_of_people(made: Diagnosis) -> None:
-    ladder = made.ladder_table()
+    ladder = made.budget_table()
     assert ladder.rows[1][1:] == (1.0, 2.0, 1.1, 2.2)
     assert ladder.rows[-1][1:] == (0.1, "", 0.1, "")
     effects = made.effects_table()
     soft, play, fault = FINDINGS
-    names = [f"{fault.name}{fault.points(made.data)}", soft.name, play.name]
+    names = [f"{fault.name}{fault.describe_fault_points(made.data)}", soft.name, play.name]
     assert [row[0] for row in effects.rows] == names  # what is tentative last
     assert_allclose([row[2] for row in effects.rows], [10.0, 60.0, 30.0])
     assert [row[-1] for row in effects.rows] == [f.evidence for f in (fault, soft, play)]
@@ -297,10 +330,10 @@ def test_a_cause_is_told_once(made: Diagnosis) -> None:
 
 
 def test_rivals_are_told_with_what_tells_them_apart(made: Diagnosis) -> None:
-    rivals = (Alternative("gear_error", "J2", 0.9, 12.0, 3.0, "20 poses"),
-              Alternative("encoder_gain", "J2", 0.5, 30.0, 9.0))  # fmt: skip
+    rivals = (AlternativeEffect("gear_error", "J2", 0.9, 12.0, 3.0, "20 poses"),
+              AlternativeEffect("encoder_gain", "J2", 0.5, 30.0, 9.0))  # fmt: skip
     found = replace(made, effects=(replace(FINDINGS[1], alternatives=rivals),))
-    rows = found.rival_table().rows
+    rows = found.alternative_table().rows
     assert [row[:2] for row in rows] == [(FINDINGS[1].name, rival.name) for rival in rivals]
     assert [row[2:5] for row in rows] == [(0.9, 12.0, 3.0), (0.5, 30.0, 9.0)]
     assert (rows[0][5], rows[1][5] in ("", "20 poses")) == ("20 poses", False)
@@ -320,12 +353,12 @@ FOUND = (  # effect, place, share, held-out RMS before and after [mm]; by share,
     ("backlash", "J4", 0.01, 0.24, 0.23),
 )
 LADDER = ("gear_error J3", "joint_compliance J2", "gear_ripple J1", "gear_error J5", "backlash J4")
-IN_WORDS = [name_step(f"+ {name}").removeprefix("+ ") for name in LADDER]
+IN_WORDS = [format_budget_step(f"+ {name}").removeprefix("+ ") for name in LADDER]
 WIDER = "measure 20 more poses all over the workspace"
 
 
-def step(name: str, rms: float) -> Step:
-    return Step(name, scores(rms), scores(rms), scores(rms))
+def step(name: str, rms: float) -> BudgetStep:
+    return BudgetStep(name, scores(rms), scores(rms), scores(rms))
 
 
 def cause(effect: str, place: str, share: float, before: float, after: float) -> Finding:
@@ -347,7 +380,7 @@ def found(bare: Diagnosis) -> Diagnosis:
     return replace(
         bare, verdict="named", effects=tuple(cause(*row) for row in FOUND), closed=0.95,
         closed_ci=(0.9, 0.97), ladder=(step("nominal", 2.0), step("geometric", 0.8), *rungs),
-        floor=Floor(0.03, 0.0, 0.03, AT_MOST), beyond=Beyond(), floor_known=True,
+        floor=NoiseFloor(0.03, 0.0, 0.03, AT_MOST), beyond=RegionHoldout(), floor_known=True,
     )  # fmt: skip
 
 
@@ -362,23 +395,23 @@ def marked(found: Diagnosis, **more: Any) -> Diagnosis:
 
 
 def test_every_verdict_opens_the_words(found: Diagnosis) -> None:
-    assert set(OPENINGS) == set(VERDICTS)
-    alternative = Alternative("link_bending", "L2", 0.9, 3.0, 1.0)
+    assert set(VERDICT_OPENINGS) == set(VERDICTS)
+    alternative = AlternativeEffect("link_bending", "L2", 0.9, 3.0, 1.0)
     first = replace(found.effects[0], alternatives=(alternative,))
     for verdict in VERDICTS:
         changed = replace(found, verdict=verdict)
         if verdict == "one_of":
             changed = replace(changed, effects=(first, *found.effects[1:]))
-            assert changed.main[0].evidence.startswith("one of these")
-        first_words = "Main causes" if verdict == "unknown" else OPENINGS[verdict]
+            assert changed.main_findings[0].evidence.startswith("one of these")
+        first_words = "Main causes" if verdict == "unknown" else VERDICT_OPENINGS[verdict]
         if verdict in ("none", "not_repeatable"):
             changed = replace(changed, effects=())
         assert changed.headline().startswith(first_words), verdict
-        assert OPENINGS[verdict] in changed.headline()
+        assert VERDICT_OPENINGS[verdict] in changed.headline()
         assert changed.summary().startswith(changed.headline())
     minor = replace(found.effects[-1], alternatives=(alternative,))
     main = replace(found, verdict="one_of", effects=(*found.effects[:-1], minor))
-    assert main.headline().startswith(OPENINGS["named"])  # a minor one alone is ambiguous
+    assert main.headline().startswith(VERDICT_OPENINGS["named"])  # a minor one alone is ambiguous
 
 
 def test_causes_stand_by_their_share_and_tables_in_the_order_of_the_ladder(
@@ -418,7 +451,9 @@ def test_minor_effects_take_one_line(found: Diagnosis) -> None:
 
 def test_alternatives_stand_at_their_own_place(found: Diagnosis) -> None:
     """Of two causes of a kind only the second has one; the measurement is for the larger share."""
-    others = [Alternative("link_bending", f"L{n}", 0.9, 3.0, 1.0, f"measure {n}") for n in (1, 2)]
+    others = [
+        AlternativeEffect("link_bending", f"L{n}", 0.9, 3.0, 1.0, f"measure {n}") for n in (1, 2)
+    ]
     large, small = found.effects[:2]
     second = replace(small, terms=(replace(small.term, effect=large.term.effect),),
                      alternatives=(others[0], replace(others[0], place="L3")))  # fmt: skip
@@ -438,9 +473,9 @@ def test_alternatives_stand_at_their_own_place(found: Diagnosis) -> None:
 
 def test_places_of_one_kind_are_told_in_one() -> None:
     alike, unlike = ("at joint 2", "at joint 1", "at joint 3"), ("at joint 2", "in the base")
-    joined = together(alike)
+    joined = join_places(alike)
     assert (numbers(joined), joined.count("joint")) == ([2.0, 1.0, 3.0], 1)
-    assert together(unlike).split(", ") == list(unlike)
+    assert join_places(unlike).split(", ") == list(unlike)
 
 
 def test_possible_effects_stand_together_below(found: Diagnosis) -> None:
@@ -455,17 +490,19 @@ def test_possible_effects_stand_together_below(found: Diagnosis) -> None:
 
 
 def test_the_remaining_error_is_given_in_its_parts(found):
-    assert not remaining_table(replace(found, remaining=None)).rows  # of a file without it
-    left = Remaining((Dependence("J3", "its load", 0.2, 0.002),), 0.1, 0.05, REPEATS)
+    assert not build_remaining_error_table(
+        replace(found, remaining=None)
+    ).rows  # of a file without it
+    left = RemainingError((DriverDependence("J3", "its load", 0.2, 0.002),), 0.1, 0.05, REPEATS)
     parts = replace(found, remaining=left)
     text = next(text for text in parts.reasons if text.startswith("Remaining error"))
     assert REPEATS in text
-    assert name_structure(left.depends[0].name) in text
+    assert format_remaining_structure(left.depends[0].name) in text
     rms = round(found.ladder[-1].trusted.rms_mm, 3)
     assert numbers(text) == [rms, 0.05, 0.2, 3.0, 0.005, 0.1]
-    assert [row[1] for row in remaining_table(parts).rows] == [0.05, 0.2, 0.1]
+    assert [row[1] for row in build_remaining_error_table(parts).rows] == [0.05, 0.2, 0.1]
     unsure = replace(parts, remaining=replace(parts.remaining, noise_mm=float("nan")))
-    assert [row[1] for row in remaining_table(unsure).rows[1:]] == [0.2, 0.1]
+    assert [row[1] for row in build_remaining_error_table(unsure).rows[1:]] == [0.2, 0.1]
     none = replace(left, depends=(), noise_mm=0.02, noise_from=DISTANCES)
     (text,) = [text for text in replace(found, remaining=none, floor_known=False).reasons
                if text.startswith("Remaining error")]  # fmt: skip
@@ -478,11 +515,11 @@ def test_what_nobody_measured_is_asked_for_first(found):
     """For every verdict, in the first sentence too."""
     for verdict in VERDICTS:
         opened = replace(found, verdict=verdict, floor_known=False)
-        assert opened.next == REVISIT
-        assert opened.reasons[0].endswith(f"; {NOT_VISITED}.")
+        assert opened.next == REVISIT_PROPOSAL
+        assert opened.reasons[0].endswith(f"; {UNKNOWN_REPEATABILITY_TEXT}.")
         known = replace(opened, floor_known=True)
-        assert NOT_VISITED not in known.headline()
-        assert known.next != REVISIT
+        assert UNKNOWN_REPEATABILITY_TEXT not in known.headline()
+        assert known.next != REVISIT_PROPOSAL
         assert known.next or verdict not in ("unknown", "not_repeatable")
 
 
@@ -516,8 +553,8 @@ def test_outliers_are_left_out_beside(found: Diagnosis) -> None:
 
 
 def test_what_does_not_help_is_not_proposed(found: Diagnosis) -> None:
-    others = (Alternative("link_bending", "L2", 0.9, 3.0, 1.0, WIDER),
-              Alternative("base_flex", "frame", 0.9, 3.0, 1.0, "no measurement considered is "
+    others = (AlternativeEffect("link_bending", "L2", 0.9, 3.0, 1.0, WIDER),
+              AlternativeEffect("base_flex", "frame", 0.9, 3.0, 1.0, "no measurement considered is "
                           "enough: the best raises the power to 2 of the 25 needed"))  # fmt: skip
     first = replace(found.effects[0], alternatives=others)
     changed = replace(found, verdict="one_of", effects=(first, *found.effects[1:]))
@@ -534,11 +571,11 @@ def test_what_does_not_help_is_not_proposed(found: Diagnosis) -> None:
 def test_every_chance_and_power_says_what_is_enough(found: Diagnosis) -> None:
     place = "J3 following its own angle"
     told = replace(found, verdict="unknown", structure=1e-7, structure_in=place)
-    assert name_chance(1e-7) in told.headline()
-    assert OPENINGS["unknown"] in told.headline()
+    assert format_p_value(1e-7) in told.headline()
+    assert VERDICT_OPENINGS["unknown"] in told.headline()
     assert replace(told, effects=()).headline().startswith("Unexplained: the error after geometry")
-    assert LEVEL in numbers(told.effects_table().title)
-    assert ENOUGH in numbers(told.rival_table().title)
+    assert FALSE_NAME_PROBABILITY in numbers(told.effects_table().title)
+    assert SUFFICIENT_SEPARATION_POWER in numbers(told.alternative_table().title)
     assert "lambda" not in told.summary()
 
 
@@ -546,7 +583,7 @@ def test_people_read_millimetres_and_milliradians_with_two_digits_of_sigma(
     found: Diagnosis,
 ) -> None:
     table = found.parameter_table()
-    cells = {row[0]: row[2:] for row in table.cells()}
+    cells = {row[0]: row[2:] for row in table.formatted_cells()}
     soft, gear = (cells[f"{effect} at joint {n}"] for effect, n in (("joint compliance", 2),
                                                                     ("gear error", 3)))  # fmt: skip
     assert soft == ["0.002", "0.00012", "mrad/(N m)"]
@@ -566,24 +603,24 @@ def fitted(name: str, place: str, value: list[float], **choice: float) -> Fitted
     return Fitted((Term(name, place, choice),), (np.array(value),))
 
 
-def cell_of(robot: mc.Robot, effects: Fitted = NOTHING) -> mc.Cell:
+def cell_of(robot: mc.Robot, effects: Fitted = NO_EFFECTS) -> mc.Cell:
     base = np.eye(4)
-    base[:3, :3], base[:3, 3] = rotation(np.array([0.2, -0.1, 1.0])), [3.0, -1.0, 0.5]
+    base[:3, :3], base[:3, 3] = rotation_from_vector(np.array([0.2, -0.1, 1.0])), [3.0, -1.0, 0.5]
     return mc.Cell(robot, base, NAMES, SPOTS, effects)
 
 
 def left_by(
     effects: Fitted, name: str = "irb2600", told: bool = True, **columns: Array
-) -> Leftover:
+) -> ResidualViews:
     """What is left of exact measurements of an arm with effects, without them and with."""
     robot, rng = mc.load_robot(name), np.random.default_rng(1)
     order = {"order": np.arange(M)[::-1] + 1.0} if told else {}
-    q = random_poses(robot, M, rng)
+    q = random_joint_values_above_floor(robot, M, rng)
     data = mc.measurements(q, rng.normal(size=(M, 3, 3)), **order, **columns)
-    data = with_history(replace(data, target_names=NAMES, sliding=robot.prismatic))
+    data = add_history_columns(replace(data, target_names=NAMES, sliding=robot.prismatic))
     first, last = cell_of(robot), cell_of(robot, effects)
     data = data.with_y(last.follow(data))
-    return Leftover.of(data, np.arange(M) % 5 == 0, 1e-5, (first, last), effects.terms)
+    return ResidualViews.from_cells(data, np.arange(M) % 5 == 0, 1e-5, (first, last), effects.terms)
 
 
 LOOSE = fitted("backlash", "J5", [1e-3])
@@ -591,38 +628,40 @@ LOOSE = fitted("backlash", "J5", [1e-3])
 
 def test_views_are_geometry_effects_and_all_but_the_first() -> None:
     left = left_by(LOOSE)
-    plain, whole, bare = left.views
+    plain, whole, bare = left.errors_by_view
     measured = left.data.y - cell_of(left.scene.robot).predict(left.data.q)
     axes = cell_of(left.scene.robot).base[:3, :3]
     assert_allclose(plain, measured @ axes, rtol=0, atol=1e-12)
     assert_allclose(whole, 0.0, atol=1e-12)
     assert_allclose(bare, plain, rtol=0, atol=1e-12)
-    assert_allclose(left.distances()[0], 1e3 * np.linalg.norm(measured, axis=-1), atol=1e-9)
+    assert_allclose(left.error_distances()[0], 1e3 * np.linalg.norm(measured, axis=-1), atol=1e-9)
     there = left.scene.robot.pose(left.data.q) @ np.append(SPOTS[1], 1.0)
-    assert_allclose(left.points[:, 1] - left.views[0][:, 1], there[:, :3], rtol=0, atol=1e-12)
-    alone = left_by(NOTHING)
-    assert len(alone.views) == 1
-    assert alone.law is None
+    assert_allclose(
+        left.measured_points[:, 1] - left.errors_by_view[0][:, 1], there[:, :3], rtol=0, atol=1e-12
+    )
+    alone = left_by(NO_EFFECTS)
+    assert len(alone.errors_by_view) == 1
+    assert alone.errors_without_first_effect is None
     assert alone.term is None
 
 
 def test_an_effect_is_taken_out_with_all_its_lines() -> None:
     ripple = [Term("gear_ripple", "J3", {"turns": t}) for t in (121.0, 242.0)]
     both = Fitted((*ripple, *LOOSE.terms), (np.ones(2), 2.0 * np.ones(2), np.ones(1)))
-    assert without(both, ripple[1]).terms == LOOSE.terms
-    assert without(both, LOOSE.terms[0]).terms == tuple(ripple)
-    assert [v.tolist() for v in without(both, LOOSE.terms[0]).values] == [[1, 1], [2, 2]]
+    assert drop_effect(both, ripple[1]).terms == LOOSE.terms
+    assert drop_effect(both, LOOSE.terms[0]).terms == tuple(ripple)
+    assert [v.tolist() for v in drop_effect(both, LOOSE.terms[0]).values] == [[1, 1], [2, 2]]
 
 
 def test_play_is_a_turn_of_its_joint_by_the_side_it_came_from() -> None:
     left = left_by(LOOSE)
-    curve = residual_curve(left)
+    curve = build_residual_curve(left)
     came = np.zeros(M)
     came[:-1] = left.data.q[:-1, 4] - left.data.q[1:, 4]  # the last row is visited first
     assert_allclose(curve.x, np.degrees(came), rtol=0, atol=1e-9)
     assert curve.xlabel.endswith("(deg)")
     assert curve.ylabel.endswith("(mrad)")
-    assert name_effect("backlash", "J5") in curve.title
+    assert format_effect("backlash", "J5") in curve.title
     plain, whole, bare = curve.y
     assert_array_equal(np.sign(plain[:-1]), np.sign(came[:-1]))
     assert 0.2 < np.abs(plain[:-1]).max() < 0.6  # half of a milliradian, less the ridge
@@ -630,28 +669,28 @@ def test_play_is_a_turn_of_its_joint_by_the_side_it_came_from() -> None:
     assert_allclose(bare, plain, rtol=1e-9)
 
 
-def static_torque(left: Leftover, joint: int) -> Array:
+def static_torque(left: ResidualViews, joint: int) -> Array:
     return np.asarray(left.scene.gravity[joint])
 
 
 def test_torques_of_masses_that_were_told_do_not_say_that_they_are_assumed() -> None:
-    scene = left_by(NOTHING).scene
-    mass, com = masses_of(scene.robot)
+    scene = left_by(NO_EFFECTS).scene
+    mass, com = link_masses_and_centres(scene.robot)
     told = replace(scene, robot=replace(scene.robot, mass=mass, com=com))
     measured = {f"tau{j + 1}": np.arange(M) for j in range(scene.joints)}
     felt = replace(scene, data=replace(scene.data, columns={**scene.data.columns, **measured}))
     for one in (told, felt):
-        label = drivers.torque(one, 1, {})[0]
+        label = curve_axes.gravity_torque_axis(one, 1, {})[0]
         assert label.endswith("(N m)")
         assert "assumed" not in label
-    assert "assumed" in drivers.torque(scene, 1, {})[0]
+    assert "assumed" in curve_axes.gravity_torque_axis(scene, 1, {})[0]
 
 
-def wave(left: Leftover, joint: int) -> Array:
+def wave(left: ResidualViews, joint: int) -> Array:
     return np.asarray(np.degrees(left.data.q[:, joint]) % (360.0 / 121.0))
 
 
-def degrees(left: Leftover, joint: int) -> Array:
+def degrees(left: ResidualViews, joint: int) -> Array:
     return np.degrees(left.data.q[:, joint])
 
 
@@ -666,7 +705,7 @@ def degrees(left: Leftover, joint: int) -> Array:
          "joint 3 within a wave of 2.98° (deg)"),
         (fitted("encoder_gain", "J4", [1e-3]), degrees, 3, "joint 4 (deg)"),
         (fitted("joint_coupling", "J5", [1e-3], source=4.0), degrees, 3, "joint 4 (deg)"),
-        (NOTHING, degrees, 0, "joint 1 (deg)"),
+        (NO_EFFECTS, degrees, 0, "joint 1 (deg)"),
     ],
     ids=lambda part: part.terms[0].effect if isinstance(part, Fitted) and part.terms else "",
 )  # fmt: skip
@@ -674,13 +713,15 @@ def test_a_curve_is_drawn_against_what_its_law_looks_at(
     effects: Fitted, law: object, joint: int, label: str
 ) -> None:
     left = left_by(effects)
-    curve = residual_curve(left)
+    curve = build_residual_curve(left)
     assert curve.xlabel == label
     wanted = law(left, joint)  # type: ignore[operator]
     assert_allclose(np.abs(curve.x), np.abs(wanted), rtol=1e-9, atol=1e-9)
     assert len(curve.y) == (3 if effects.terms else 1)
     if effects.terms and effects.terms[0].effect in ("encoder_gain", "joint_coupling"):
-        shown = turns(left)[-1][:, guilty(left, turns(left))]
+        shown = equivalent_joint_rotations(left)[-1][
+            :, select_shown_joint(left, equivalent_joint_rotations(left))
+        ]
         assert_allclose(curve.y[-1], 1e3 * (shown - shown.mean()), rtol=0, atol=1e-12)
         assert abs(curve.y[0].mean()) > 1e-3  # a constant turn, which geometry takes
 
@@ -689,26 +730,26 @@ def test_time_and_heat_are_drawn_along_their_motion() -> None:
     heat = np.linspace(20.0, 30.0, M)
     warm = left_by(fitted("thermal_growth", "all", [3e-4], temperature=1.0, apart=0.0),
                    temperature=heat)  # fmt: skip
-    curve = residual_curve(warm)
+    curve = build_residual_curve(warm)
     assert curve.xlabel == "temperature (°C)"
     assert_array_equal(curve.x, np.broadcast_to(heat, (3, M)))
     assert curve.ylabel.endswith("(mm)")
-    assert_allclose(np.abs(curve.y[0]), warm.distances()[0].T, rtol=0, atol=1e-6)
+    assert_allclose(np.abs(curve.y[0]), warm.error_distances()[0].T, rtol=0, atol=1e-6)
     jump = left_by(fitted("session_jump", "frame", [1e-3, 0, 0, 0, 0, 0], since=0.5))
-    curve = residual_curve(jump)
-    assert name_effect("session_jump", "frame") in curve.title
+    curve = build_residual_curve(jump)
+    assert format_effect("session_jump", "frame") in curve.title
     assert_allclose(curve.x[0], np.linspace(1.0, 0.0, M), rtol=0, atol=1e-12)
     assert_allclose(curve.y[0], 1.0 * (curve.x >= 0.5), rtol=0, atol=1e-9)
     shift = left_by(fitted("target_shift", "smr2", [0.0, 2e-3, 0.0], since=0.5))
-    curve = residual_curve(shift)
-    assert name_effect("target_shift", "smr2") in curve.title
+    curve = build_residual_curve(shift)
+    assert format_effect("target_shift", "smr2") in curve.title
     assert curve.y[0].shape == curve.x.shape == (1, M)
     assert_allclose(curve.y[0], 2.0 * (curve.x >= 0.5), rtol=0, atol=1e-9)
 
 
 def test_an_offset_is_drawn_along_the_line_of_sight() -> None:
     left = left_by(fitted("target_offset", "all", [1e-3]))
-    curve = residual_curve(left)
+    curve = build_residual_curve(left)
     away = np.linalg.norm(left.data.y, axis=-1).T  # the instrument is the origin
     assert_allclose(curve.x, away, rtol=1e-12)
     assert_allclose(curve.y[0], 1.0, rtol=0, atol=1e-9)
@@ -716,8 +757,8 @@ def test_an_offset_is_drawn_along_the_line_of_sight() -> None:
 
 
 def test_a_slide_is_shown_in_millimetres() -> None:
-    left = left_by(NOTHING, "scara_600")
-    label, x = own_value(left.scene, 2, {})
+    left = left_by(NO_EFFECTS, "scara_600")
+    label, x = joint_value_axis(left.scene, 2, {})
     assert label.endswith("(mm)")
     assert_allclose(x, 1e3 * left.data.q[:, 2], rtol=1e-14)
 
@@ -725,20 +766,22 @@ def test_a_slide_is_shown_in_millimetres() -> None:
 @pytest.mark.parametrize("told", [True, False])
 def test_errors_in_the_order_of_the_visits(told: bool) -> None:
     left = left_by(LOOSE, told=told)
-    curve = order_curve(left)
-    rms = np.sqrt(np.mean(left.distances()[0] ** 2, axis=1))
+    curve = build_visit_order_curve(left)
+    rms = np.sqrt(np.mean(left.error_distances()[0] ** 2, axis=1))
     assert_allclose(curve.y[0], rms, rtol=1e-12)
     if told:
         assert_array_equal(curve.x, np.arange(M)[::-1] + 1.0)
     assert ("visit" in curve.xlabel) == told
     some = replace(left, errors=tuple(np.where(np.arange(3)[:, None] == 1, np.nan, e)
                                       for e in left.errors))  # fmt: skip
-    rms = np.sqrt(np.mean(left.distances()[0][:, [0, 2]] ** 2, axis=1))
-    assert_allclose(order_curve(some).y[0], rms, rtol=1e-12)
+    rms = np.sqrt(np.mean(left.error_distances()[0][:, [0, 2]] ** 2, axis=1))
+    assert_allclose(build_visit_order_curve(some).y[0], rms, rtol=1e-12)
 
 
 def test_a_curve_names_its_views() -> None:
-    curve = Curve("t", "x (m)", "y (mm)", np.arange(2.0), (np.ones(2), np.array([np.nan, 2.0])))
+    curve = ResidualCurve(
+        "t", "x (m)", "y (mm)", np.arange(2.0), (np.ones(2), np.array([np.nan, 2.0]))
+    )
     told = curve.to_dict()
     assert told["x"] == {"label": "x (m)", "values": [0.0, 1.0]}
     assert told["views"] == [
@@ -748,9 +791,9 @@ def test_a_curve_names_its_views() -> None:
 
 
 def test_joint_equivalent_is_the_turn():
-    scene = left_by(NOTHING).scene
+    scene = left_by(NO_EFFECTS).scene
     turn = 1e-3 * np.random.default_rng(0).normal(size=(scene.poses, scene.joints))
     error = np.einsum("nkcm,mn->mkc", scene.jacobian, turn)
-    off = np.abs(joint_equivalent(error, scene.jacobian, 1e-7) - turn)
+    off = np.abs(fit_equivalent_rotations(error, scene.jacobian, 1e-7) - turn)
     assert np.median(off) < 1e-5  # large only where the wrist or the arm is stretched
     assert np.quantile(off[:, :3], 0.9) < 1e-4

@@ -11,20 +11,24 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
-from minimax_cal.diagnosing.curves import Leftover
-from minimax_cal.diagnosing.foot import asked_foot, foot_notices, foot_tells
-from minimax_cal.diagnosing.joint import Joint, joint
-from minimax_cal.diagnosing.result import Diagnosis, Finding
-from minimax_cal.diagnosing.set_aside import WHY
-from minimax_cal.diagnosing.study import studied
-from minimax_cal.fitting.floor import DISTANCES
-from minimax_cal.fitting.options import Options, silent
-from minimax_cal.fitting.solve import fit_cell
-from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.faults.nests import RESEAT
-from minimax_cal.measuring.history import with_history
-from minimax_cal.measuring.measurements import TOOL, USER, Measurements
-from minimax_cal.measuring.set_aside import left_out
+from minimax_cal.core.arrays import Array
+from minimax_cal.diagnosing.diagnosis import Diagnosis, Finding
+from minimax_cal.diagnosing.foot_reflectors import (
+    compare_laws_with_reflectors,
+    describe_reflector_agreement,
+    mark_contradicted_findings,
+)
+from minimax_cal.diagnosing.joint_fit import GeometryEffectFit, fit_geometry_and_effects
+from minimax_cal.diagnosing.residual_curves import ResidualViews
+from minimax_cal.diagnosing.set_aside_points import SET_ASIDE_REASONS
+from minimax_cal.diagnosing.study import linearise_geometry
+from minimax_cal.fitting.cell_fit import fit_cell
+from minimax_cal.fitting.noise_floor import DISTANCES
+from minimax_cal.fitting.options import Options, silent_progress
+from minimax_cal.measuring.faults.target_steps import TARGET_RESEAT_EFFECT
+from minimax_cal.measuring.measurements import SET_ASIDE_BY_TOOL, SET_ASIDE_BY_USER, Measurements
+from minimax_cal.measuring.set_aside_points import set_aside_points_named_by_user
+from minimax_cal.measuring.visit_history import add_history_columns
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.simulate import Simulation, Truth, simulate
 
@@ -63,9 +67,11 @@ def test_two_stations_are_diagnosed_as_one(plain: mc.Diagnosis) -> None:
     assert again.data.frames.keys() == {"a", "b"}
     before, after = (d.cells[-1].error(d.data) for d in (found, again))
     assert_allclose(after, before, rtol=0, atol=1e-9)  # digits of millimetres
-    left = Leftover.of(found.data, found.held, found.noise, found.cells, [])
+    left = ResidualViews.from_cells(found.data, found.held, found.noise, found.cells, [])
     reach = mc.load_robot(ROBOT).reach()
-    assert np.nanmax(np.linalg.norm(left.points, axis=-1)) < 1.5 * reach  # all about one base
+    assert (
+        np.nanmax(np.linalg.norm(left.measured_points, axis=-1)) < 1.5 * reach
+    )  # all about one base
 
 
 def foot() -> dict[str, np.ndarray]:
@@ -124,22 +130,24 @@ def crept(sees: bool) -> tuple[mc.Robot, Measurements]:
     }
     order = {"order": np.arange(data.poses, dtype=float)}
     drifted = replace(data, y=moved(data.y), columns={**data.columns, **columns, **order})
-    return mc.load_robot("irb2600"), with_history(drifted)
+    return mc.load_robot("irb2600"), add_history_columns(drifted)
 
 
-def drifting(sees: bool, term: Term) -> tuple[Joint, Measurements]:
+def drifting(sees: bool, term: Term) -> tuple[GeometryEffectFit, Measurements]:
     robot, data = crept(sees)
-    fit = fit_cell(robot, data, Options(objective="sum"), silent)
-    return joint(studied(robot, data, fit), [term]), data
+    fit = fit_cell(robot, data, Options(objective="sum"), silent_progress)
+    return fit_geometry_and_effects(linearise_geometry(robot, data, fit), [term]), data
 
 
 @pytest.mark.parametrize("term", [SLOW, TWO])
 def test_reflectors_that_move_confirm_a_drift(term: Term) -> None:
     """Of one course and of two, whose twelve parameters were a traceback."""
-    told = [*foot_tells(*drifting(True, term))]
-    (notice,) = foot_notices(told)
+    told = [*compare_laws_with_reflectors(*drifting(True, term))]
+    (notice,) = describe_reflector_agreement(told)
     found = Finding((term,), (), (), (), (), again=1.0)
-    assert [one.evidence for one in asked_foot([found], told)] == ["confirmed, 1.00"]
+    assert [one.evidence for one in mark_contradicted_findings([found], told)] == [
+        "confirmed, 1.00"
+    ]
     assert not any(odd for _, _, odd in told)
     assert told[0][1] in notice
     assert "x +" in notice
@@ -147,12 +155,12 @@ def test_reflectors_that_move_confirm_a_drift(term: Term) -> None:
 
 @pytest.mark.parametrize("term", [SLOW, TWO])
 def test_reflectors_that_stand_contradict_it(term: Term) -> None:
-    told = [*foot_tells(*drifting(False, term))]
-    (notice,) = foot_notices(told)
+    told = [*compare_laws_with_reflectors(*drifting(False, term))]
+    (notice,) = describe_reflector_agreement(told)
     assert [odd for _, _, odd in told] == ["x"]
     assert told[0][1] in notice
     other = Finding((Term("backlash", "J1"),), (), (), (), (), again=1.0)
-    found = [*asked_foot([replace(other, terms=(term,)), other], told)]
+    found = [*mark_contradicted_findings([replace(other, terms=(term,)), other], told)]
     assert found[0].evidence.startswith("confirmed, 1.00, contradicted in x")
     assert found[1].evidence == "confirmed, 1.00"
 
@@ -160,7 +168,7 @@ def test_reflectors_that_stand_contradict_it(term: Term) -> None:
 def test_without_reflectors_nothing_is_said() -> None:
     fit, data = drifting(True, SLOW)
     columns = {name: column for name, column in data.columns.items() if name[:4] != "base"}
-    assert not list(foot_tells(fit, replace(data, columns=columns)))
+    assert not list(compare_laws_with_reflectors(fit, replace(data, columns=columns)))
 
 
 # ---- reseats -------------------------------------------------------------------------------------
@@ -185,7 +193,7 @@ def test_a_reseat_of_5_mm_is_named_with_its_size(targets: int) -> None:
     assert found.verdict == "named"
     (reseat,) = found.effects
     assert (reseat.term.effect, reseat.term.place) == ("target_reseat", "smr2")
-    assert reseat.at == "at smr2"
+    assert reseat.place_text == "at smr2"
     assert "re-seated" in reseat.cause
     assert_allclose(reseat.values[0], 5e-3, rtol=0.02)
     assert min(reseat.rows) == sim.data.line[ROW] or max(reseat.rows) == sim.data.line[ROW - 1]
@@ -222,11 +230,15 @@ def test_8_of_60_poses_that_are_off_are_named(targets: int) -> None:
 def test_what_no_fit_counts_is_listed_and_counted() -> None:
     """The re-seated part, and a point that the user set aside; both in the accuracy with them."""
     _, data, _ = reseat_of(3)
-    found = mc.diagnose("irb120", left_out(data, ["3:smr1=looks odd"]), quick=True)
+    found = mc.diagnose(
+        "irb120", set_aside_points_named_by_user(data, ["3:smr1=looks odd"]), quick=True
+    )
     by = {(p.by, p.target) for p in found.set_aside}
-    assert by == {(USER, "smr1"), (TOOL, "smr2")}
+    assert by == {(SET_ASIDE_BY_USER, "smr1"), (SET_ASIDE_BY_TOOL, "smr2")}
     assert len(found.set_aside) == 1 + min(ROW, 60 - ROW)
-    assert {p.why for p in found.set_aside if p.by == TOOL} == {WHY[RESEAT]}
+    assert {p.why for p in found.set_aside if p.by == SET_ASIDE_BY_TOOL} == {
+        SET_ASIDE_REASONS[TARGET_RESEAT_EFFECT]
+    }
     assert found.with_them is not None
     assert_allclose(found.with_them.max_mm, 5.0, rtol=0.05)
     content = found.to_dict()

@@ -7,19 +7,21 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 import minimax_cal as mc
-from minimax_cal.dynamics.logs.table import Run
+from minimax_cal.core.arrays import Array
+from minimax_cal.dynamics.logs.log_table import Run
 from minimax_cal.dynamics.regressor import (
-    Motion,
-    inertial_parameters,
+    JointMotion,
+    build_nominal_inertial_parameters,
+    compute_link_inertial_parameters,
     inverse_dynamics,
-    link_parameters,
 )
-from minimax_cal.ground.arrays import Array
 from minimax_cal.robots.robot import robot_from_dict
 
 NOISE = 0.1  # of a torque sample [N m]
 RATE = 100.0  # [Hz]
-Extra = Callable[[Motion, Array, Array], Array]  # of motion, rigid torque and time: more torque
+Extra = Callable[
+    [JointMotion, Array, Array], Array
+]  # of motion, rigid torque and time: more torque
 
 
 def fourier(
@@ -57,10 +59,10 @@ def three_joints() -> mc.Robot:
     return robot_from_dict({"name": "three joints", "units": units, "joints": joints})
 
 
-def driven_torque(motion: Motion, body: Array, turns: Array | None = None) -> Array:
+def driven_torque(motion: JointMotion, body: Array, turns: Array | None = None) -> Array:
     """Torques (m, 3) of the drives of the arm.  turns: (3, 3) of its joints per turn of a drive."""
     c = np.eye(3) if turns is None else turns
-    moved = Motion(*(part @ c.T for part in (motion.q, motion.qd, motion.qdd)))
+    moved = JointMotion(*(part @ c.T for part in (motion.q, motion.qd, motion.qdd)))
     return np.asarray(inverse_dynamics(three_joints(), moved, body) @ c)
 
 
@@ -83,9 +85,11 @@ def simulated(
     rng, robot, out = np.random.default_rng(seed), three_joints(), []
     for number, mass in enumerate(np.broadcast_to(carried, runs)):
         time = np.arange(0.0, seconds, 1.0 / RATE)
-        motion = Motion(*fourier(rng, time, 3, 0.1 + 0.05 * (number % 3)))
-        body = inertial_parameters(robot)
-        body[-1] += link_parameters(float(mass), np.array([0.0, 0.0, 0.05]), np.zeros(6))
+        motion = JointMotion(*fourier(rng, time, 3, 0.1 + 0.05 * (number % 3)))
+        body = build_nominal_inertial_parameters(robot)
+        body[-1] += compute_link_inertial_parameters(
+            float(mass), np.array([0.0, 0.0, 0.05]), np.zeros(6)
+        )
         rigid = driven_torque(motion, body, turns)
         torque = rigid + noise * rng.normal(size=rigid.shape)
         if friction:

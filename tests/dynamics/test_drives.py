@@ -7,23 +7,23 @@ import pytest
 from numpy.testing import assert_allclose
 
 from minimax_cal.dynamics.drives import (
-    Drive,
+    CommandedRuns,
     DriveFit,
-    Followed,
-    covariance_of,
+    PositionDrive,
+    compute_jackknife_changes,
+    find_speed_limit,
+    find_torque_limit,
     fit_drive,
-    left_out,
-    predicts,
-    speed_limit,
-    torque_limit,
+    has_smaller_held_out_residuals,
+    jackknife_covariance,
 )
-from minimax_cal.dynamics.logs.table import TORQUE, Run
-from minimax_cal.dynamics.rows import Arm, prepare
+from minimax_cal.dynamics.logs.log_table import TORQUE_UNIT, Run
+from minimax_cal.dynamics.torque_rows import TorqueArm, resample_and_filter_runs
 from tests.dynamics.motions import three_joints
 
 HZ, SECONDS, NOISE = 250.0, 12.0, 0.2
-REAL = Drive(2000.0, 90.0, delay=0.0123)
-GIVEN = Drive(1500.0, 120.0)
+REAL = PositionDrive(2000.0, 90.0, delay=0.0123)
+GIVEN = PositionDrive(1500.0, 120.0)
 
 
 def waves(time: np.ndarray, seed: int, order: int = 0) -> np.ndarray:
@@ -35,7 +35,7 @@ def waves(time: np.ndarray, seed: int, order: int = 0) -> np.ndarray:
     return (rate[:, None] ** order * size * np.sin(turn)).sum(axis=1)
 
 
-def logged(seed: int, drive: Drive, lag: float = 0.03, speed: float = 1.0) -> Run:
+def logged(seed: int, drive: PositionDrive, lag: float = 0.03, speed: float = 1.0) -> Run:
     """A joint lags its command and trembles; its drive pushes as the closed form says."""
     time = np.arange(0.0, SECONDS, 1.0 / HZ)
     rng = np.random.default_rng(seed + 100)
@@ -47,16 +47,22 @@ def logged(seed: int, drive: Drive, lag: float = 0.03, speed: float = 1.0) -> Ru
     asked = drive.stiffness * (waves(late, seed) - q)
     asked -= drive.damper * (qd - drive.ahead * speed * waves(late, seed, 1))
     torque = np.clip(asked, -drive.torque, drive.torque) + NOISE * rng.normal(size=q.shape)
-    return Run(f"r{seed}", "log.csv", time, q, qd, None, torque, TORQUE, command=waves(at, seed))
+    return Run(
+        f"r{seed}", "log.csv", time, q, qd, None, torque, TORQUE_UNIT, command=waves(at, seed)
+    )
 
 
-def followed(*runs: Run) -> Followed:
+def followed(*runs: Run) -> CommandedRuns:
     robot = three_joints()
-    arm = Arm.of(robot, np.ones(3), robot.ratio, np.zeros(10), prepare(runs))
-    return Followed.of(runs, arm, lambda motion: 0.0 * motion.q)
+    arm = TorqueArm.build(
+        robot, np.ones(3), robot.ratio, np.zeros(10), resample_and_filter_runs(runs)
+    )
+    return CommandedRuns.build(runs, arm, lambda motion: 0.0 * motion.q)
 
 
-def fit(drive: Drive, given: Drive = GIVEN, seed: int = 0, **more: float) -> DriveFit:
+def fit(
+    drive: PositionDrive, given: PositionDrive = GIVEN, seed: int = 0, **more: float
+) -> DriveFit:
     runs = [logged(seed + k, drive, **more) for k in range(4)]
     found = fit_drive(followed(*runs[:3]), followed(runs[3]), 1, given)
     assert found is not None
@@ -102,8 +108,11 @@ def test_intervals_hold_under_noise_that_remembers():
                 noise[i] = 0.96 * noise[i - 1] + 0.5 * rng.normal(size=3)
             runs.append(replace(run, torque=run.torque + noise))
         found = fit_drive(followed(*runs[:3]), followed(runs[3]), 1, GIVEN)
-        inside += [abs(getattr(found.drive, name) - getattr(REAL, name)) < 1.96 * found.sigma[name]
-                   for name in ("stiffness", "damper", "delay")]  # fmt: skip
+        inside += [
+            abs(getattr(found.drive, name) - getattr(REAL, name))
+            < 1.96 * found.sigma_by_field[name]
+            for name in ("stiffness", "damper", "delay")
+        ]
     assert 0.88 < np.mean(inside) <= 1.0
 
 
@@ -115,8 +124,8 @@ def test_intervals_hold_where_few_stretches_tell():
         noise = rng.normal(size=481)
         rest = noise[1:] + noise[:-1]  # remembers
         off = np.linalg.lstsq(columns, rest, rcond=None)[0]
-        change = left_out(columns, rest - columns @ off, stretch)
-        inside.append(np.abs(off) < 1.96 * np.sqrt(np.diag(covariance_of(change))))
+        change = compute_jackknife_changes(columns, rest - columns @ off, stretch)
+        inside.append(np.abs(off) < 1.96 * np.sqrt(np.diag(jackknife_covariance(change))))
     assert_allclose(np.mean(inside, axis=0), 0.95, atol=0.03)
 
 
@@ -131,11 +140,11 @@ def test_a_speed_at_which_torque_falls_is_a_limit():
     slowed = [replace(run, torque=np.where(np.abs(run.qd) > top * np.abs(run.qd).max(axis=0),
                                            run.torque - 60.0 * np.sign(run.qd), run.torque))
               for run in runs]  # fmt: skip
-    seen = followed(*slowed).samples(1, REAL)
-    assert np.isinf(speed_limit(followed(*runs).samples(1, REAL), np.inf)[0])
-    fastest = np.abs(seen.qd).max()
-    assert 0.9 * fastest < speed_limit(seen, np.inf)[0] < fastest
-    assert np.isinf(torque_limit(seen)[0])
+    seen = followed(*slowed).build_joint_samples(1, REAL)
+    assert np.isinf(find_speed_limit(followed(*runs).build_joint_samples(1, REAL), np.inf)[0])
+    fastest = np.abs(seen.speed).max()
+    assert 0.9 * fastest < find_speed_limit(seen, np.inf)[0] < fastest
+    assert np.isinf(find_torque_limit(seen)[0])
 
 
 def test_a_joint_without_motion_tells_nothing():
@@ -145,7 +154,7 @@ def test_a_joint_without_motion_tells_nothing():
 
 
 def test_stretches_decide_whether_rows_are_predicted_better():
-    rows = followed(logged(0, REAL)).joint(1)
-    rest, rng = rows.rest(REAL, {}), np.random.default_rng(0)
-    assert predicts(rows, rest, rows.rest(GIVEN, {}))
-    assert not predicts(rows, rest, rest + 1e-6 * rng.normal(size=rest.shape))
+    rows = followed(logged(0, REAL)).build_joint_rows(1)
+    rest, rng = rows.compute_residuals(REAL, {}), np.random.default_rng(0)
+    assert has_smaller_held_out_residuals(rows, rest, rows.compute_residuals(GIVEN, {}))
+    assert not has_smaller_held_out_residuals(rows, rest, rest + 1e-6 * rng.normal(size=rest.shape))

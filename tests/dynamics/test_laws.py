@@ -9,10 +9,15 @@ from dynamics.motions import simulated, three_joints
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.dynamics.laws import LAWS, QUANTITIES, WORDS, Law, Tuned
-from minimax_cal.dynamics.rows import Arm, Scene, prepare, sense_of
-from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.tables import Table
+from minimax_cal.core.errors import OptionError
+from minimax_cal.core.tables import Table
+from minimax_cal.dynamics.laws import LAW_QUANTITIES, TORQUE_EFFECT_WORDS, TORQUE_LAWS, Law, Tuned
+from minimax_cal.dynamics.torque_rows import (
+    ArmMotion,
+    TorqueArm,
+    compute_soft_speed_sign,
+    resample_and_filter_runs,
+)
 
 DOCS = Path(__file__).parents[2] / "docs" / "torques.md"
 WAVE = Law(
@@ -22,24 +27,28 @@ WAVE = Law(
 
 
 @pytest.fixture
-def scene() -> Scene:
-    logs, robot = prepare(simulated(seed=1, runs=2)), three_joints()
-    arm = Arm.of(robot, np.ones(3), np.full(3, 50.0), np.zeros(10), logs)
-    return Scene.of(arm, logs)
+def scene() -> ArmMotion:
+    logs, robot = resample_and_filter_runs(simulated(seed=1, runs=2)), three_joints()
+    arm = TorqueArm.build(robot, np.ones(3), np.full(3, 50.0), np.zeros(10), logs)
+    return ArmMotion.build(arm, logs)
 
 
 @pytest.fixture
 def registered() -> Iterator[Law]:
     yield mc.register_law(WAVE)
-    del LAWS[WAVE.name], WORDS[WAVE.name]
+    del TORQUE_LAWS[WAVE.name], TORQUE_EFFECT_WORDS[WAVE.name]
 
 
-def test_a_curve_over_speed_is_the_law_along_it(scene: Scene) -> None:
-    v, seen = QUANTITIES["v"](scene, 0), []
-    sense = sense_of(scene.logs.motion.qd[:, 0], scene.arm.soft[0])
-    for name, law in LAWS.items():
-        for form in law.curve(v, sense, law.tried(scene, 0)[0]):
-            assert_allclose(form, law.columns(scene, 0, law.tried(scene, 0)[0])[:, 0], rtol=1e-15)
+def test_a_curve_over_speed_is_the_law_along_it(scene: ArmMotion) -> None:
+    v, seen = LAW_QUANTITIES["v"](scene, 0), []
+    sense = compute_soft_speed_sign(scene.logs.motion.qd[:, 0], scene.arm.soft[0])
+    for name, law in TORQUE_LAWS.items():
+        for form in law.compute_friction_curves(v, sense, law.list_initial_tunings(scene, 0)[0]):
+            assert_allclose(
+                form,
+                law.build_columns(scene, 0, law.list_initial_tunings(scene, 0)[0])[:, 0],
+                rtol=1e-15,
+            )
             seen.append(name)
     assert seen == ["degressive", "stribeck", "asymmetry"]
 
@@ -66,6 +75,6 @@ def test_wrong_facts_are_refused() -> None:
 
 def test_the_documentation_has_every_law() -> None:
     rows = [(law.name, law.words, ", ".join(law.torque).replace("np.", "") or None,
-             ", ".join(law.held) or None) for law in LAWS.values()]  # fmt: skip
-    table = Table.made("Laws", rows, "name | law | torque per unit | held by").markdown()
+             ", ".join(law.held) or None) for law in TORQUE_LAWS.values()]  # fmt: skip
+    table = Table.from_rows("Laws", rows, "name | law | torque per unit | held by").markdown()
     assert table[table.index("|") :].strip() in DOCS.read_text(encoding="utf-8")

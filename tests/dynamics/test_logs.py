@@ -15,9 +15,13 @@ from dynamics.motions import fourier
 from numpy.testing import assert_allclose, assert_array_equal
 
 import minimax_cal as mc
-from minimax_cal.dynamics.given import against_robot, gravity, runs_of
-from minimax_cal.dynamics.logs import are_logs, import_logs, read_runs, runs_text
-from minimax_cal.ground.arrays import Array
+from minimax_cal.core.arrays import Array
+from minimax_cal.dynamics.known_inputs import (
+    add_notices_of_robot_mismatch,
+    compute_gravity_torques,
+    read_checked_runs,
+)
+from minimax_cal.dynamics.logs import are_logs, format_runs_csv, read_log_files, read_runs
 
 N = 3
 WRITTEN = 1e-6  # rounding of the numbers in the files
@@ -93,9 +97,9 @@ def test_rtde_with_spaces_and_many_columns(tmp_path: Path) -> None:
         columns |= {f"{stem}_{j}": values[:, j] for j in range(6)}
     columns |= {"robot_mode": np.full(600, 7.0), "payload": np.full(600, 1.5)}
     path = write(tmp_path / "ur.csv", columns, " ")
-    found = import_logs(path)
+    found = read_log_files(path)
     (run,) = found.runs
-    assert found.titles == ("UR RTDE",)
+    assert found.format_names == ("UR RTDE",)
     assert (run.unit, run.payload, run.notices, run.qdd) == ("A", 1.5, (), None)
     assert_allclose(run.q, made["q"], atol=WRITTEN)
     assert are_logs([path])
@@ -175,12 +179,12 @@ def test_what_is_written_is_read_again(tmp_path: Path) -> None:
     slides["tau2_N"] = slides.pop("tau2_Nm")
     other = {n: v[::-1] + 0.001 for n, v in slides.items() if not n.startswith("qd")}
     other["t_s"] = slides["t_s"]
-    found = import_logs([write(tmp_path / "a.csv", slides), write(tmp_path / "b.csv", other)])
-    assert found.sliding.tolist() == [False, True, False]
-    (tmp_path / "both.csv").write_text(runs_text(found.runs, found.sliding))
-    again = import_logs(tmp_path / "both.csv")
+    found = read_log_files([write(tmp_path / "a.csv", slides), write(tmp_path / "b.csv", other)])
+    assert found.is_prismatic.tolist() == [False, True, False]
+    (tmp_path / "both.csv").write_text(format_runs_csv(found.runs, found.is_prismatic))
+    again = read_log_files(tmp_path / "both.csv")
     assert [run.name for run in again.runs] == ["both:a", "both:b"]
-    assert again.sliding.tolist() == found.sliding.tolist()
+    assert again.is_prismatic.tolist() == found.is_prismatic.tolist()
     for one, two in zip(found.runs, again.runs, strict=True):
         assert_allclose(one.q, two.q, atol=1e-8)
         assert_allclose(one.torque, two.torque, atol=1e-6)
@@ -409,26 +413,28 @@ def heavy_run(robot: mc.Robot, gain: float = 1.0, lever: float = 0.05) -> tuple[
     rng = np.random.default_rng(7)
     q, qd, _ = fourier(rng, t, n, rate=0.2)
     q = 0.3 * q
-    tau = gravity(heavy, q) + 8.0 * np.sign(qd) + rng.normal(size=q.shape)
+    tau = compute_gravity_torques(heavy, q) + 8.0 * np.sign(qd) + rng.normal(size=q.shape)
     return heavy, mc.Run("a", "a.csv", t, q, None, None, gain * tau, "N m")
 
 
 def test_a_current_called_effort(robot: mc.Robot) -> None:
-    assert against_robot(*heavy_run(robot)).notices == ()
+    assert add_notices_of_robot_mismatch(*heavy_run(robot)).notices == ()
     heavy, run = heavy_run(robot, 0.08)
-    run = against_robot(heavy, run)
+    run = add_notices_of_robot_mismatch(heavy, run)
     (notice,) = run.notices
     (scale,) = re.findall(r"joint [23] is (\S+) times", notice)
     assert float(scale) == pytest.approx(0.08, rel=0.1)
-    assert against_robot(heavy, replace(run, unit="A", notices=())).notices == ()
-    assert against_robot(robot, replace(run, notices=())).notices == ()  # no masses given
+    assert add_notices_of_robot_mismatch(heavy, replace(run, unit="A", notices=())).notices == ()
+    assert (
+        add_notices_of_robot_mismatch(robot, replace(run, notices=())).notices == ()
+    )  # no masses given
 
 
 def test_torques_of_other_joints_or_signs(robot: mc.Robot) -> None:
     heavy, run = heavy_run(robot)
-    (told,) = against_robot(heavy, replace(run, torque=run.torque[:, ::-1])).notices
+    (told,) = add_notices_of_robot_mismatch(heavy, replace(run, torque=run.torque[:, ::-1])).notices
     assert re.search(r"the torque of joint [45] follows gravity at joint [23] .* order", told)
-    (told,) = against_robot(heavy, replace(run, torque=-run.torque)).notices
+    (told,) = add_notices_of_robot_mismatch(heavy, replace(run, torque=-run.torque)).notices
     assert re.search(r"joint [23] has the sign of gravity, not of what holds it", told)
 
 
@@ -437,21 +443,21 @@ def test_real_torques_are_those_of_the_arm() -> None:
         pytest.skip("no shared data")
     (real,) = read_runs(next(urdf.parent.glob("*.csv")))
     arm = mc.load_robot(urdf)
-    assert against_robot(arm, real).notices == ()
-    (told,) = against_robot(arm, replace(real, unit="N m")).notices
+    assert add_notices_of_robot_mismatch(arm, real).notices == ()
+    (told,) = add_notices_of_robot_mismatch(arm, replace(real, unit="N m")).notices
     assert "a current?" in told
     swapped = real.torque[:, [0, 2, 1, 3, 4, 5]]
-    (told,) = against_robot(arm, replace(real, torque=swapped)).notices
+    (told,) = add_notices_of_robot_mismatch(arm, replace(real, torque=swapped)).notices
     assert re.findall(r"joint (\d)", told)[:2] == ["3", "2"]
 
 
 def test_joints_outside_their_limits(robot: mc.Robot) -> None:
     _, run = heavy_run(robot, lever=0.0)
     off = replace(run, q=run.q + np.array([0.0, 4.0, 0.0, 0.0, 0.0, 0.0]))
-    ((told,),) = [one.notices for one in runs_of(robot, robot, [off])]
+    ((told,),) = [one.notices for one in read_checked_runs(robot, robot, [off])]
     assert re.search(r"a.csv: joint 2 moves from .* deg, outside the limits of", told)
     with pytest.raises(mc.OptionError, match=r"a.csv: has 5 joints, .* has 6"):
-        runs_of(robot, robot, [replace(run, q=run.q[:, :5])])
+        read_checked_runs(robot, robot, [replace(run, q=run.q[:, :5])])
 
 
 # ---- runs that coincide, and runs that are short -------------------------------------------------

@@ -6,12 +6,21 @@ from dynamics.motions import simulated, three_joints
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.dynamics.probes import Past, beside, foretold
-from minimax_cal.dynamics.regressor import Motion
-from minimax_cal.dynamics.rows import Arm, Scene, prepare, sense_of
-from minimax_cal.evidence.noise import orthonormal
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.linear_algebra import project_out
+from minimax_cal.core.arrays import Array
+from minimax_cal.core.linear_algebra import project_out
+from minimax_cal.dynamics.regressor import JointMotion
+from minimax_cal.dynamics.residual_structure import (
+    MotionHistory,
+    compute_predicted_square_share,
+    project_out_model_and_normalise,
+)
+from minimax_cal.dynamics.torque_rows import (
+    ArmMotion,
+    TorqueArm,
+    compute_soft_speed_sign,
+    resample_and_filter_runs,
+)
+from minimax_cal.selection.noise_model import orthonormal_basis
 
 GROUP = np.repeat(np.arange(12), 60)
 
@@ -29,10 +38,10 @@ def test_columns_foretell_what_holds_in_every_group_and_never_noise() -> None:
     chances = []
     for _ in range(30):
         noise, field = red(rng), rng.normal(size=(len(GROUP), 20))
-        share, p = foretold(field, noise, GROUP, GROUP)
+        share, p = compute_predicted_square_share(field, noise, GROUP, GROUP)
         assert share < 0.1
         chances.append(p)
-        there, sure = foretold(field, noise + field[:, 3], GROUP, GROUP)
+        there, sure = compute_predicted_square_share(field, noise + field[:, 3], GROUP, GROUP)
         assert there == pytest.approx(0.5, abs=0.1)
         assert sure < 1e-4
     assert min(chances) > 1e-3
@@ -42,35 +51,37 @@ def test_one_group_alone_is_no_evidence() -> None:
     rng = np.random.default_rng(3)
     field, left = rng.normal(size=(len(GROUP), 5)), 0.1 * rng.normal(size=len(GROUP))
     left += 10.0 * field[:, 0] * (GROUP == 4)
-    assert foretold(field, left, GROUP, GROUP)[1] > 0.05
+    assert compute_predicted_square_share(field, left, GROUP, GROUP)[1] > 0.05
 
 
 def test_what_the_model_imitates_is_no_probe() -> None:
     rng = np.random.default_rng(4)
-    basis, columns = orthonormal(rng.normal(size=(100, 6))), rng.normal(size=(100, 3))
-    field = beside(basis, columns)
+    basis, columns = orthonormal_basis(rng.normal(size=(100, 6))), rng.normal(size=(100, 3))
+    field = project_out_model_and_normalise(basis, columns)
     assert_allclose(basis.T @ field, 0.0, atol=1e-12)
     assert_allclose(np.mean(field**2, axis=0), 1.0)
-    imitated = beside(basis, basis @ rng.normal(size=(6, 2)))
+    imitated = project_out_model_and_normalise(basis, basis @ rng.normal(size=(6, 2)))
     assert np.abs(imitated).max() < 1e-8
     assert_allclose(project_out(basis, basis), 0.0, atol=1e-12)
 
 
 def test_a_spring_with_play_stays_within_it() -> None:
-    logs = prepare(simulated(seed=1, runs=2))
-    arm = Arm.of(three_joints(), np.ones(3), np.full(3, np.nan), np.zeros(10), logs)
-    past = Past.of(Scene.of(arm, logs))
-    assert np.abs(past.lagged).max() == pytest.approx(1.0)
-    assert_allclose(past.lagged[logs.start[:-1]], 0.0, atol=1e-12)  # each run begins anew
+    logs = resample_and_filter_runs(simulated(seed=1, runs=2))
+    arm = TorqueArm.build(three_joints(), np.ones(3), np.full(3, np.nan), np.zeros(10), logs)
+    past = MotionHistory.build(ArmMotion.build(arm, logs))
+    assert np.abs(past.play_positions).max() == pytest.approx(1.0)
+    assert_allclose(
+        past.play_positions[logs.run_starts[:-1]], 0.0, atol=1e-12
+    )  # each run begins anew
     mean = np.abs(logs.motion.qd).mean(axis=0)
-    assert_allclose(past.recent[..., 0].mean(axis=0), mean, rtol=0.1)
+    assert_allclose(past.recent_speed_averages[..., 0].mean(axis=0), mean, rtol=0.1)
 
 
 def test_friction_as_soft_as_a_simulator_has_it_is_no_cause() -> None:
-    def softer(motion: Motion, rigid: Array, time: Array) -> Array:
+    def softer(motion: JointMotion, rigid: Array, time: Array) -> Array:
         out = np.zeros_like(rigid)
         qd = motion.qd[:, 2]
-        out[:, 2] = 1.5 * (sense_of(qd, 0.1) - np.sign(qd))
+        out[:, 2] = 1.5 * (compute_soft_speed_sign(qd, 0.1) - np.sign(qd))
         return out
 
     soft = mc.diagnose_motion(three_joints(), simulated(softer, seed=3))

@@ -10,16 +10,16 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
+from minimax_cal.core.arrays import Array
 from minimax_cal.dynamics.regressor import (
-    Motion,
-    base_parameters,
-    inertial_parameters,
+    JointMotion,
+    build_nominal_inertial_parameters,
+    compute_base_parameter_combinations,
     inverse_dynamics,
     regressor,
 )
-from minimax_cal.ground.arrays import Array
-from minimax_cal.robots.gravity import G
-from minimax_cal.robots.kinematics import forward
+from minimax_cal.robots.gravity_torques import STANDARD_GRAVITY
+from minimax_cal.robots.kinematics import forward_kinematics
 
 EXACT = 1e-10  # of the largest torque
 COUPLED = {"J3": {"J2": -1.0}, "J5": {"J4": 0.5, "J5": 0.0}, "J6": {"J4": 1.0}}  # J5 has no drive
@@ -57,9 +57,9 @@ def robot_of(content: dict) -> mc.Robot:  # type: ignore[type-arg]
     return robot_from_dict(content)
 
 
-def motion(robot: mc.Robot, seed: int, count: int = 60) -> Motion:
+def motion(robot: mc.Robot, seed: int, count: int = 60) -> JointMotion:
     q, qd, qdd = np.random.default_rng(seed).normal(size=(3, count, robot.joints)) * 1.5
-    return Motion(*(np.where(robot.passive, 0.0, part) for part in (q, qd, qdd)))
+    return JointMotion(*(np.where(robot.passive, 0.0, part) for part in (q, qd, qdd)))
 
 
 def from_drives(robot: mc.Robot) -> Array:
@@ -71,7 +71,7 @@ def from_drives(robot: mc.Robot) -> Array:
     return matrix
 
 
-def by_energy(robot: mc.Robot, moved: Motion) -> Array:
+def by_energy(robot: mc.Robot, moved: JointMotion) -> Array:
     """Torques (m, n) of the drives by Lagrange: complex steps of poses, differences of energy."""
     weight, turns = np.linalg.norm(robot.up), from_drives(robot)
     about = np.zeros((robot.joints, 3, 3))
@@ -83,13 +83,13 @@ def by_energy(robot: mc.Robot, moved: Motion) -> Array:
         out, turned = np.zeros(len(q)), (q + 1e-30j * qd) @ turns.T
         for i in range(robot.joints):
             some = slice(i + 1)
-            pose = forward(robot.mdh[some], turned[:, some], robot.prismatic[some])
+            pose = forward_kinematics(robot.mdh[some], turned[:, some], robot.prismatic[some])
             centre = pose[:, :3, :3] @ robot.com[i] + pose[:, :3, 3]
             spin = np.swapaxes(pose[:, :3, :3].real, 1, 2) @ pose[:, :3, :3].imag / 1e-30
             w = np.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], axis=1)
             fast = ((centre.imag / 1e-30) ** 2).sum(axis=1)
             out += 0.5 * (robot.mass[i] * fast + np.einsum("mi,ij,mj->m", w, about[i], w))
-            out -= robot.mass[i] * G * centre.real @ robot.up / weight
+            out -= robot.mass[i] * STANDARD_GRAVITY * centre.real @ robot.up / weight
         return out
 
     def momentum(s: float, j: int) -> Array:
@@ -106,11 +106,11 @@ def by_energy(robot: mc.Robot, moved: Motion) -> Array:
     return torque
 
 
-def by_pinocchio(robot: mc.Robot, moved: Motion) -> Array:
+def by_pinocchio(robot: mc.Robot, moved: JointMotion) -> Array:
     """Torques (m, n) by another's recursion."""
     pin = pytest.importorskip("pinocchio")
     model = pin.Model()
-    model.gravity.linear = -G * robot.up
+    model.gravity.linear = -STANDARD_GRAVITY * robot.up
     before, parent = pin.SE3.Identity(), 0
     for i, (a, d, theta, alpha, beta) in enumerate(robot.mdh):
         slides = robot.prismatic[i]
@@ -136,7 +136,7 @@ def by_pinocchio(robot: mc.Robot, moved: Motion) -> Array:
 @pytest.mark.parametrize("seed", range(4))
 def test_torques_are_those_of_pinocchio(seed: int, slides: tuple[int, ...], coupled: bool) -> None:
     robot = random_arm(seed, slides, coupled)
-    moved, body = motion(robot, seed), inertial_parameters(robot)
+    moved, body = motion(robot, seed), build_nominal_inertial_parameters(robot)
     theirs = by_pinocchio(robot, moved)
     for ours in (regressor(robot, moved) @ body.ravel(), inverse_dynamics(robot, moved, body)):
         assert_allclose(ours, theirs, rtol=0, atol=EXACT * np.abs(theirs).max())
@@ -162,13 +162,13 @@ def test_a_urdf_has_the_torques_of_pinocchio(tmp_path: Path) -> None:
     path = tmp_path / "arm.urdf"
     path.write_text("".join(parts) + "</robot>")
     robot, model = mc.load_robot(path), pin.buildModelFromUrdf(str(path))
-    model.gravity.linear = np.array([0.0, 0.0, -G])
+    model.gravity.linear = np.array([0.0, 0.0, -STANDARD_GRAVITY])
     data, moved = model.createData(), motion(robot, 5)
     theirs = []
     for q, qd, qdd in zip(moved.q, moved.qd, moved.qdd, strict=True):
         wound = [*q[:2], np.cos(q[2]), np.sin(q[2]), q[3]]  # a continuous joint is a pair there
         theirs.append(pin.rnea(model, data, np.array(wound), qd, qdd))
-    ours = regressor(robot, moved) @ inertial_parameters(robot).ravel()
+    ours = regressor(robot, moved) @ build_nominal_inertial_parameters(robot).ravel()
     assert_allclose(ours, theirs, rtol=0, atol=EXACT * np.abs(theirs).max())
 
 
@@ -177,7 +177,7 @@ def test_a_urdf_has_the_torques_of_pinocchio(tmp_path: Path) -> None:
 def test_torques_are_those_of_the_energy(slides: tuple[int, ...], coupled: bool) -> None:
     """Twin without Pinocchio; differences of 1e-4 err by some 1e-8, rounding by 1e-11."""
     robot = random_arm(1, slides, coupled)
-    moved, body = motion(robot, 3, 20), inertial_parameters(robot)
+    moved, body = motion(robot, 3, 20), build_nominal_inertial_parameters(robot)
     theirs = by_energy(robot, moved)
     ours = regressor(robot, moved) @ body.ravel()
     assert_allclose(ours, theirs, rtol=0, atol=1e-6 * np.abs(theirs).max())
@@ -189,7 +189,7 @@ def test_base_parameters_of_known_arms() -> None:
     """36 of a spatial arm with six turning joints whose first is vertical [Khalil, Dombre 2002]."""
     robot = mc.load_robot("ur10")
     columns = regressor(robot, motion(robot, 1, 200)).reshape(-1, 60)
-    base = base_parameters(columns)
+    base = compute_base_parameter_combinations(columns)
     assert base.shape == (60, 36)
     value = np.random.default_rng(0).normal(size=60)
     assert_allclose(columns @ base @ (base.T @ value), columns @ value, rtol=0, atol=1e-8)
@@ -200,7 +200,11 @@ def test_a_robot_file_keeps_inertia_and_gain(tmp_path: Path) -> None:
     assert not len(robot.drive_gain)
     robot.save(tmp_path / "arm.json")
     again = mc.load_robot(tmp_path / "arm.json")
-    assert_allclose(inertial_parameters(again), inertial_parameters(robot), rtol=1e-12)
+    assert_allclose(
+        build_nominal_inertial_parameters(again),
+        build_nominal_inertial_parameters(robot),
+        rtol=1e-12,
+    )
     content = robot.to_dict()
     content["joints"][2]["drive_gain"] = 11.5
     assert mc.Robot.to_dict(robot_of(content))["joints"][2]["drive_gain"] == 11.5

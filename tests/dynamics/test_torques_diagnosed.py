@@ -14,15 +14,24 @@ from dynamics.motions import Extra, driven_torque, fourier, simulated, three_joi
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from experiments.motion_cases import MUJOCO, RATIO, Case, make
+from experiments.motion_cases import GIVEN_GEAR_RATIO, MUJOCO_GENERATOR, MotionCase, simulate_case
 from minimax_cal.cli import torques
-from minimax_cal.dynamics.budget import USUALLY
-from minimax_cal.dynamics.laws import WORDS, Term
-from minimax_cal.dynamics.masses import select_weighed_payloads
-from minimax_cal.dynamics.model import Columns
-from minimax_cal.dynamics.regressor import Motion, inertial_parameters, inverse_dynamics
-from minimax_cal.dynamics.rows import ROW_HZ, Arm, Scene, prepare
-from minimax_cal.ground.arrays import Array
+from minimax_cal.core.arrays import Array
+from minimax_cal.dynamics.cross_validation import USUAL_FRICTION_STEP_NAME
+from minimax_cal.dynamics.laws import TORQUE_EFFECT_WORDS, TorqueTerm
+from minimax_cal.dynamics.mass_tests import select_payloads_with_weight
+from minimax_cal.dynamics.regressor import (
+    JointMotion,
+    build_nominal_inertial_parameters,
+    inverse_dynamics,
+)
+from minimax_cal.dynamics.torque_regression import TorqueColumns
+from minimax_cal.dynamics.torque_rows import (
+    ROW_RATE_HZ,
+    ArmMotion,
+    TorqueArm,
+    resample_and_filter_runs,
+)
 
 ARM = three_joints()
 
@@ -30,7 +39,7 @@ ARM = three_joints()
 def at(j: int, law: Extra) -> Extra:
     """More torque at one joint."""
 
-    def more(motion: Motion, rigid: Array, time: Array) -> Array:
+    def more(motion: JointMotion, rigid: Array, time: Array) -> Array:
         out = np.zeros_like(rigid)
         out[:, j] = law(motion, rigid, time)
         return out
@@ -41,13 +50,13 @@ def at(j: int, law: Extra) -> Extra:
 def compliant(j: int, compliance: float, turns: Array | None = None) -> Extra:
     """A drive whose gear turns back by its torque.  turns: as `driven_torque`."""
 
-    def more(motion: Motion, rigid: Array, time: Array) -> Array:
+    def more(motion: JointMotion, rigid: Array, time: Array) -> Array:
         by = np.zeros_like(rigid)
         by[:, j] = -compliance * rigid[:, j]
         rate = np.gradient(by, time, axis=0)
         change = np.gradient(rate, time, axis=0)
-        moved = Motion(motion.q + by, motion.qd + rate, motion.qdd + change)
-        return driven_torque(moved, inertial_parameters(ARM), turns) - rigid
+        moved = JointMotion(motion.q + by, motion.qd + rate, motion.qdd + change)
+        return driven_torque(moved, build_nominal_inertial_parameters(ARM), turns) - rigid
 
     return more
 
@@ -55,7 +64,7 @@ def compliant(j: int, compliance: float, turns: Array | None = None) -> Extra:
 def late(seconds: float) -> Extra:
     """Torques that are logged after the motion, to the first order."""
 
-    def more(motion: Motion, rigid: Array, time: Array) -> Array:
+    def more(motion: JointMotion, rigid: Array, time: Array) -> Array:
         friction = np.sign(motion.qd) * [4.0, 3.0, 1.5] + motion.qd * [3.0, 4.0, 1.0]
         return -seconds * np.gradient(rigid + friction, time, axis=0)
 
@@ -164,17 +173,20 @@ def test_two_payloads_are_two() -> None:
 
 @pytest.mark.parametrize("mass", [0.0, 0.2])
 def test_what_has_no_weight_is_no_payload(mass: float) -> None:
-    logs = prepare(simulated(carried=(0.0, mass, 0.0), seed=3))
-    arm = Arm.of(ARM, np.ones(3), ARM.ratio, np.zeros(10), logs)
-    columns, term = Columns(Scene.of(arm, logs)), Term("payload", "L3", {"run1": 1.0})
-    assert select_weighed_payloads(columns, [], [term]) == ([term] if mass else [])
+    logs = resample_and_filter_runs(simulated(carried=(0.0, mass, 0.0), seed=3))
+    arm = TorqueArm.build(ARM, np.ones(3), ARM.ratio, np.zeros(10), logs)
+    columns, term = (
+        TorqueColumns(ArmMotion.build(arm, logs)),
+        TorqueTerm("payload", "L3", {"run1": 1.0}),
+    )
+    assert select_payloads_with_weight(columns, [], [term]) == ([term] if mass else [])
 
 
 def test_runs_that_differ_by_an_inertia_carry_no_payload() -> None:
     """Friction of another curve than the first that is tried made them differ."""
     pytest.importorskip("mujoco")
-    made = make(Case("single", MUJOCO, (("degressive", 8),), 2078605665))
-    found = mc.diagnose_motion(made.robot, made.runs, ratio=RATIO, payload=made.payload)
+    made = simulate_case(MotionCase("single", MUJOCO_GENERATOR, (("degressive", 8),), 2078605665))
+    found = mc.diagnose_motion(made.robot, made.runs, ratio=GIVEN_GEAR_RATIO, payload=made.payload)
     assert names(found) == {"degressive:J1"}
 
 
@@ -227,7 +239,7 @@ def test_what_has_no_law_is_unexplained() -> None:
     worst = found.unexplained[0]
     assert (worst.place, worst.follows) == ("J2", "other joints")
     assert 0.0 < worst.size < worst.noise
-    assert worst.sentence("N m") in found.headline()
+    assert worst.describe_structure("N m") in found.headline()
 
 
 @pytest.mark.parametrize("law", [
@@ -295,13 +307,13 @@ def test_the_command_writes_what_evaluate_reads(
     assert (np.array(judged["rms_moving"]) < 1.2 * claimed).all()
     assert run("torques", tmp_path / "arm.json", *learn) == 0
     out = capsys.readouterr().out
-    assert f"{WORDS['load_friction']} at J2" in out
+    assert f"{TORQUE_EFFECT_WORDS['load_friction']} at J2" in out
     assert run("diagnose", tmp_path / "arm.json", *learn) == 0
     again, err = capsys.readouterr()
     assert again.splitlines()[:8] == out.splitlines()[:8]
     assert err.startswith(f"taken: {learn[0]} holds torques of 3 joints")
     assert run("evaluate", motion, new) == 0
-    assert USUALLY in capsys.readouterr().out
+    assert USUAL_FRICTION_STEP_NAME in capsys.readouterr().out
 
 
 def test_a_file_holds_the_whole_diagnosis(tmp_path: Path) -> None:
@@ -315,7 +327,7 @@ def test_a_file_holds_the_whole_diagnosis(tmp_path: Path) -> None:
     here, there = (mc.evaluate_motion(each, fresh) for each in (found, again))
     assert_allclose(here.steps[-1].rms, there.steps[-1].rms, rtol=1e-9)
     assert here.steps[-1].rms_moving[1] < 1.3 * found.budget[-1].holdout_rms_moving[1]
-    assert found.held_run.time[1] == pytest.approx(1.0 / ROW_HZ)
+    assert found.held_run.time[1] == pytest.approx(1.0 / ROW_RATE_HZ)
     (tmp_path / "c.json").write_text(json.dumps({**one, "schema": 2}))
     with pytest.raises(mc.CalibrationError, match="is of schema 2, this version knows 1"):
         mc.load_motion(tmp_path / "c.json")
@@ -364,10 +376,10 @@ def test_currents_without_a_gain_are_refused_before_the_search(
 
 def test_the_picture_shows_every_joint() -> None:
     pytest.importorskip("matplotlib")
-    from minimax_cal.reporting.plots.motion import motion_figure
+    from minimax_cal.reporting.plots.motion_figure import build_motion_figure
 
     found = mc.diagnose_motion(ARM, simulated(seed=2, runs=2))
-    cells = motion_figure(found).axes
+    cells = build_motion_figure(found).axes
     assert len(cells) == 9
     measured, predicted = (line.get_ydata() for line in cells[0].lines)
     off = np.asarray(measured) - np.asarray(predicted)
@@ -385,8 +397,8 @@ def stopping(seed: int, share: float = 0.0) -> mc.Run:
     q = fourier(rng, np.cumsum(rate) * 0.01, 3, 0.15)[0]
     q -= np.sign(np.gradient(q, axis=0)[1380]) * 4e-4 * np.clip((time[:, None] - 15.0) / 4, 0, 1)
     qd = np.gradient(q, time, axis=0)
-    motion = Motion(q, qd, np.gradient(qd, time, axis=0))
-    rigid = inverse_dynamics(ARM, motion, inertial_parameters(ARM))
+    motion = JointMotion(q, qd, np.gradient(qd, time, axis=0))
+    rigid = inverse_dynamics(ARM, motion, build_nominal_inertial_parameters(ARM))
     torque = rigid + qd * [3.0, 4.0, 1.0]
     torque[:, 1] += share * np.abs(rigid[:, 1]) * np.sign(qd[:, 1])
     bent = np.zeros(3)

@@ -8,53 +8,53 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from minimax_cal.evidence.noise import Noise, Problem, orthonormal
-from minimax_cal.evidence.remains import (
-    TOGETHER,
-    Component,
-    Fading,
-    Rest,
-    asked,
-    evened,
-    rest_of,
-    times_before,
+from minimax_cal.core.arrays import Array
+from minimax_cal.selection.noise_model import LinearProblem, Noise, orthonormal_basis
+from minimax_cal.selection.remaining_structure import (
+    MAX_VISITS_PER_BLOCK,
+    FadingMemory,
+    StructureComponent,
+    WhitenedResidual,
+    correct_leverage,
+    count_earlier_occurrences,
+    find_remaining_structure,
+    whiten_residual,
 )
-from minimax_cal.ground.arrays import Array
 
 VISITS, WIDTH = 80, 6
 PLAIN = Noise(0.0, 1.0, 0.0)
 STRAIGHT = np.tile(np.eye(WIDTH), (VISITS, 1, 1))
 
 
-def problem(rng: np.random.Generator, error: Array) -> Problem:
+def problem(rng: np.random.Generator, error: Array) -> LinearProblem:
     """Rows beside eight nuisance columns."""
     rows = VISITS * WIDTH
-    return Problem(
+    return LinearProblem(
         error=error,
-        basis=orthonormal(rng.normal(size=(rows, 8))),
+        nuisance_basis=orthonormal_basis(rng.normal(size=(rows, 8))),
         variance_ratio=np.ones(rows),
-        size=1.0,
-        group=np.repeat(np.arange(VISITS), WIDTH),
+        mean_variance_ratio=1.0,
+        row_groups=np.repeat(np.arange(VISITS), WIDTH),
         measured=np.ones(rows, dtype=bool),
-        exact=1e-9,
+        rounding_noise=1e-9,
     )
 
 
-def places(rng: np.random.Generator) -> list[Component]:
+def places(rng: np.random.Generator) -> list[StructureComponent]:
     """Four places, three drivers each."""
     x = rng.uniform(-1.0, 1.0, (3, VISITS))
     drivers = {f"driver {i + 1}": np.array([[u, u**2, np.cos(3.0 * u)]]) for i, u in enumerate(x)}
     out = []
     for place in "ABCD":
         motion = rng.normal(size=(VISITS * WIDTH, 1))
-        out += [Component(place, name, motion, f) for name, f in drivers.items()]
+        out += [StructureComponent(place, name, motion, f) for name, f in drivers.items()]
     return out
 
 
-def rest(rng: np.random.Generator, error: Array) -> Rest:
+def rest(rng: np.random.Generator, error: Array) -> WhitenedResidual:
     """What is left of an error."""
     none = np.zeros((len(error), 0))
-    return rest_of(problem(rng, error), PLAIN, none, STRAIGHT)
+    return whiten_residual(problem(rng, error), PLAIN, none, STRAIGHT)
 
 
 def test_what_fades_is_the_root_of_its_covariance():
@@ -63,7 +63,7 @@ def test_what_fades_is_the_root_of_its_covariance():
     lag = np.arange(30)[:, None] - np.arange(30)
     root = np.where(lag >= 0, 0.6 ** np.maximum(lag, 0), 0.0)
     expected = ((root @ felt[:, order]) ** 2).sum(axis=(0, 1))
-    assert np.allclose(Fading(order, 0.6).score(felt), expected, rtol=1e-12)
+    assert np.allclose(FadingMemory(order, 0.6).score_products(felt), expected, rtol=1e-12)
 
 
 def test_noise_is_called_remains_as_often_as_the_level_says():
@@ -71,7 +71,11 @@ def test_noise_is_called_remains_as_often_as_the_level_says():
     chances = []
     for _ in range(60):
         what = places(rng)
-        chances.append(asked(rest(rng, rng.normal(size=VISITS * WIDTH)), what).loud_ones[0].p)
+        chances.append(
+            find_remaining_structure(rest(rng, rng.normal(size=VISITS * WIDTH)), what)
+            .significant_components[0]
+            .p
+        )
     rare = np.mean(np.array(chances) < 0.05)
     assert rare < 0.14  # 0.05 + 3 sigma
 
@@ -81,10 +85,10 @@ def test_a_motion_that_scatters_by_itself_is_no_remainder():
     chances = []
     for _ in range(25):
         what = places(rng)
-        shaken = what[0].motion[:, 0] * np.repeat(rng.normal(size=VISITS), WIDTH)
+        shaken = what[0].motion_columns[:, 0] * np.repeat(rng.normal(size=VISITS), WIDTH)
         error = rng.normal(size=VISITS * WIDTH) + 5.0 * shaken
         error[:WIDTH] += 40.0  # and one visit that is off
-        chances.append(asked(rest(rng, error), what).loud_ones[0].p)
+        chances.append(find_remaining_structure(rest(rng, error), what).significant_components[0].p)
     assert np.mean(np.array(chances) < 0.05) < 0.15
 
 
@@ -93,25 +97,27 @@ def test_what_is_there_is_found_with_its_place_driver_and_size(size):
     rng = np.random.default_rng(7)
     what = places(rng)
     true = what[4]
-    field = true.motion[:, 0] * np.repeat(true.feature[0, 0], WIDTH)
+    field = true.motion_columns[:, 0] * np.repeat(true.driver_features[0, 0], WIDTH)
     field *= size / np.sqrt(np.mean(field**2))
-    found = asked(rest(rng, rng.normal(size=VISITS * WIDTH) + field), what).loud_ones[0]
+    found = find_remaining_structure(
+        rest(rng, rng.normal(size=VISITS * WIDTH) + field), what
+    ).significant_components[0]
     assert (found.place, found.driver) == (true.place, true.driver)
-    assert found.name == f"{true.place} following {true.driver}"
+    assert found.place_and_driver == f"{true.place} following {true.driver}"
     assert found.p < 0.005
-    assert found.share == pytest.approx(size**2 / (1.0 + size**2), rel=0.5)
+    assert found.square_fraction == pytest.approx(size**2 / (1.0 + size**2), rel=0.5)
 
 
 def test_what_was_fitted_does_not_remain():
     rng = np.random.default_rng(8)
     what = places(rng)
-    field = what[4].motion[:, 0] * np.repeat(what[4].feature[0, 0], WIDTH)
+    field = what[4].motion_columns[:, 0] * np.repeat(what[4].driver_features[0, 0], WIDTH)
     rows = problem(rng, rng.normal(size=VISITS * WIDTH) + 3.0 * field)
-    beside = rest_of(rows, PLAIN, field[:, None], STRAIGHT)
-    assert asked(beside, what).loud_ones[0].p > 0.01
-    assert beside.dof == VISITS * WIDTH - 9
-    fixed = [replace(one, motion=np.zeros_like(one.motion)) for one in what]
-    assert asked(beside, fixed).loud_ones == ()
+    beside = whiten_residual(rows, PLAIN, field[:, None], STRAIGHT)
+    assert find_remaining_structure(beside, what).significant_components[0].p > 0.01
+    assert beside.degrees_of_freedom == VISITS * WIDTH - 9
+    fixed = [replace(one, motion_columns=np.zeros_like(one.motion_columns)) for one in what]
+    assert find_remaining_structure(beside, fixed).significant_components == ()
 
 
 def test_the_axes_of_a_visits_rows_do_not_matter():
@@ -124,25 +130,33 @@ def test_the_axes_of_a_visits_rows_do_not_matter():
         shape = VISITS, WIDTH, -1
         return np.asarray((np.swapaxes(turn, 1, 2) @ columns.reshape(shape)).reshape(columns.shape))
 
-    other = replace(rows, error=turned(rows.error), basis=turned(rows.basis))
+    other = replace(rows, error=turned(rows.error), nuisance_basis=turned(rows.nuisance_basis))
     none = np.zeros((VISITS * WIDTH, 0))
-    straight = asked(rest_of(rows, PLAIN, none, STRAIGHT), what).loud_ones
-    what = [replace(one, motion=turned(one.motion)) for one in what]
-    turned = asked(rest_of(other, PLAIN, none, turn), what).loud_ones
+    straight = find_remaining_structure(
+        whiten_residual(rows, PLAIN, none, STRAIGHT), what
+    ).significant_components
+    what = [replace(one, motion_columns=turned(one.motion_columns)) for one in what]
+    turned = find_remaining_structure(
+        whiten_residual(other, PLAIN, none, turn), what
+    ).significant_components
     for one, same in zip(straight, turned, strict=True):
-        assert (one.name, one.p) == (same.name, same.p)
-        assert (one.score, one.share) == pytest.approx((same.score, same.share), rel=1e-9)
+        assert (one.place_and_driver, one.p) == (same.place_and_driver, same.p)
+        assert (one.score, one.square_fraction) == pytest.approx(
+            (same.score, same.square_fraction), rel=1e-9
+        )
 
 
 def test_many_visits_to_one_pose_are_evened_some_at_a_time(rng):
     """Blocks of few visits leave the rest as it was; times of a number are counted in order."""
     group = np.array([3, 1, 3, 3, 1, 2])
-    assert times_before(group).tolist() == [0, 0, 1, 2, 1, 0]
+    assert count_earlier_occurrences(group).tolist() == [0, 0, 1, 2, 1, 0]
     m, wide, p = 200, 3, 4
     basis = np.linalg.qr(rng.normal(size=(m * wide, p)))[0]
     rows = rng.normal(size=m * wide)
     rows = (rows - basis @ (basis.T @ rows)).reshape(m, wide)
     spread = np.broadcast_to(np.eye(wide), (m, wide, wide))
-    apart, one = (evened(rows, basis.reshape(m, wide, p), spread, g)
-                  for g in (np.arange(m) // TOGETHER, np.zeros(m, dtype=int)))  # fmt: skip
+    apart, one = (
+        correct_leverage(rows, basis.reshape(m, wide, p), spread, g)
+        for g in (np.arange(m) // MAX_VISITS_PER_BLOCK, np.zeros(m, dtype=int))
+    )
     assert_allclose(one, apart, atol=1e-12)

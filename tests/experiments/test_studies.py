@@ -13,25 +13,33 @@ import pytest
 from numpy.testing import assert_allclose
 
 from experiments import convergence, pseudo_inverse
-from experiments.convergence import Job, Setting
-from experiments.errata import some_arm
-from experiments.pseudo_inverse import CONVERGED, arm, joint_rows, least_step, separable_rows
-from minimax_cal.robots.kinematics import forward
+from experiments.convergence import ConvergenceJob, ConvergenceSetting
+from experiments.errata import draw_arm_and_points
+from experiments.pseudo_inverse import (
+    ENDED_CONVERGED,
+    arm_points_and_axes,
+    joint_jacobian_and_error,
+    pseudo_inverse_step,
+    separable_jacobian_and_error,
+)
+from minimax_cal.robots.kinematics import forward_kinematics
 
 # ---- studies -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("method", convergence.PAPER)
-@pytest.mark.parametrize("unit", convergence.UNITS)
+@pytest.mark.parametrize("method", convergence.PAPER_S_METHODS)
+@pytest.mark.parametrize("unit", convergence.LENGTH_UNITS_PER_METRE)
 def test_the_letter_and_the_library_reach_the_same_minimum(method, unit):
-    setting = Setting(seed=1)
-    least = convergence.least_cost(setting)
-    robot, model = convergence.problem_of(setting)
-    begin = convergence.flat(robot, 0.2, -0.1)
-    _, cost, ended, _ = convergence.letter(method, unit, model, begin, 2000)
-    assert ended == CONVERGED
+    setting = ConvergenceSetting(seed=1)
+    least = convergence.global_minimum_cost(setting)
+    robot, model = convergence.build_identifiable_model(setting)
+    begin = convergence.paper_start_vector(robot, 0.2, -0.1)
+    _, cost, ended, _ = convergence.run_paper_iteration(method, unit, model, begin, 2000)
+    assert ended == ENDED_CONVERGED
     assert_allclose(cost, least, rtol=1e-6)
-    ours = convergence.run(Job(setting, method, "identifiable", (0.2,), (-0.1,), 2000))
+    ours = convergence.run_starts(
+        ConvergenceJob(setting, method, "identifiable", (0.2,), (-0.1,), 2000)
+    )
     assert ours.converged == (True,)
     assert_allclose(ours.cost[0], least, rtol=1e-6)
 
@@ -62,22 +70,26 @@ def test_the_arm_is_the_librarys(robot):
     rng = np.random.default_rng(0)
     at = rng.normal(size=39)
     q = rng.normal(size=(7, 6))
-    flange = forward(at[:30].reshape(5, 6).T, q, robot.prismatic)
+    flange = forward_kinematics(at[:30].reshape(5, 6).T, q, robot.prismatic)
     tip = flange[:, :3, :3] @ at[36:] + flange[:, :3, 3]
-    assert_allclose(arm(at, q)[0].T, tip @ euler(*at[33:36]).T + at[30:33], rtol=0, atol=1e-13)
+    assert_allclose(
+        arm_points_and_axes(at, q)[0].T, tip @ euler(*at[33:36]).T + at[30:33], rtol=0, atol=1e-13
+    )
 
 
 def test_rows_are_derivatives():
-    at, q, y = some_arm()
-    rows, error = joint_rows(at, q, y)
-    assert_allclose(error, y - arm(at, q)[0].ravel(), rtol=0, atol=0)
-    assert_allclose(rows, differences(lambda x: arm(x, q)[0].ravel(), at), rtol=0, atol=NEAR)
-    _, rows, c = separable_rows(at, q, y)
-    slope = differences(lambda x: separable_rows(x, q, y)[2], at)
+    at, q, y = draw_arm_and_points()
+    rows, error = joint_jacobian_and_error(at, q, y)
+    assert_allclose(error, y - arm_points_and_axes(at, q)[0].ravel(), rtol=0, atol=0)
+    assert_allclose(
+        rows, differences(lambda x: arm_points_and_axes(x, q)[0].ravel(), at), rtol=0, atol=NEAR
+    )
+    _, rows, c = separable_jacobian_and_error(at, q, y)
+    slope = differences(lambda x: separable_jacobian_and_error(x, q, y)[2], at)
     assert_allclose(rows, -slope[ANGLES], rtol=0, atol=NEAR * 10)
     lengths = np.setdiff1d(np.arange(39), ANGLES)
     assert_allclose(slope[lengths], 0.0, rtol=0, atol=NEAR)  # eliminated: c does not depend on them
-    assert np.linalg.norm(joint_rows(at, q, y)[0][lengths] @ c) > 0.0
+    assert np.linalg.norm(joint_jacobian_and_error(at, q, y)[0][lengths] @ c) > 0.0
 
 
 def test_the_least_step_is_that_of_the_pseudo_inverse():
@@ -85,7 +97,9 @@ def test_the_least_step_is_that_of_the_pseudo_inverse():
     J = rng.normal(size=(30, 7)) @ rng.normal(size=(7, 12))
     H, g = J.T @ J, J.T @ rng.normal(size=30)
     expected = np.linalg.pinv(H, rcond=1e-12, hermitian=True) @ g
-    assert_allclose(least_step(H, g), expected, rtol=0, atol=1e-10 * np.abs(expected).max())
+    assert_allclose(
+        pseudo_inverse_step(H, g), expected, rtol=0, atol=1e-10 * np.abs(expected).max()
+    )
 
 
 COMPARED = """
@@ -102,7 +116,7 @@ def test_compiled_and_plain_are_the_same():
     pytest.importorskip("numba", reason="needs numba: pip install 'minimax-cal[fast]'")
     here = Path(__file__).parent
     code = COMPARED.format(root=str(here.parent.parent), here=str(here))
-    environment = {**os.environ, pseudo_inverse.LOOPS: "compiled"}
+    environment = {**os.environ, pseudo_inverse.LOOPS_ENVIRONMENT_VARIABLE: "compiled"}
     made = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True,
                           text=True, check=True)  # fmt: skip
     assert float(made.stdout) < 1e-13

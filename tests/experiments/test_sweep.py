@@ -28,11 +28,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 import minimax_cal as mc
 from experiments import __main__ as studies
 from experiments import sweep as module
-from experiments.record import save_figure, save_json, save_tables
+from experiments.study_record import write_figure_files, write_json, write_tables
 from experiments.sweep import Study, study_options, sweep
-from minimax_cal.ground import parallel
-from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.tables import Table
+from minimax_cal.core import parallel
+from minimax_cal.core.errors import OptionError
+from minimax_cal.core.tables import Table
 
 # ---- sweep ---------------------------------------------------------------------------------------
 
@@ -126,9 +126,9 @@ def test_damaged_parts_are_computed_again(expected, tmp_path):
     paths[3].write_bytes(hashlib.sha256(nonsense).hexdigest().encode() + b"\n" + nonsense)
     gone = pickle.dumps(Found(0, np.zeros(1), 0)).replace(b"Found", b"Gonee")
     paths[4].write_bytes(hashlib.sha256(gone).hexdigest().encode() + b"\n" + gone)
-    assert [len(module.read_part(path)) for path in paths[:6]] == [0, 0, 0, 0, 0, 1]
+    assert [len(module.read_cached_result(path)) for path in paths[:6]] == [0, 0, 0, 0, 0, 1]
     assert same(sweep(work, JOBS, **one), expected)
-    assert all(module.read_part(path) for path in paths)
+    assert all(module.read_cached_result(path) for path in paths)
 
 
 class Trap:
@@ -146,13 +146,13 @@ def test_a_part_holds_data_and_runs_nothing(tmp_path):
     part, sprung = tmp_path / "x.part", tmp_path / "sprung"
     for content in (pickle.dumps(Trap(sprung)), pickle.dumps([os.system, "true"])):
         part.write_bytes(hashlib.sha256(content).hexdigest().encode() + b"\n" + content)
-        assert module.read_part(part) == []
+        assert module.read_cached_result(part) == []
     assert not sprung.exists()
     with pytest.raises(pickle.UnpicklingError, match="is no data"):
-        module.write_part(part, work)
+        module.write_cached_result(part, work)
     good = {"a": (Found(1, np.arange(3.0), 2), None), "b": [np.float64(2.5), Path("x"), "y"]}
-    module.write_part(part, good)
-    (found,) = module.read_part(part)
+    module.write_cached_result(part, good)
+    (found,) = module.read_cached_result(part)
     assert found["a"][0].values.tolist() == [0.0, 1.0, 2.0]
     assert found["b"] == good["b"]
 
@@ -230,7 +230,7 @@ def run_toy(*arguments: str) -> Result:
 def test_nobody_at_the_address(tmp_path, monkeypatch):
     pytest.importorskip("distributed")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(parallel, "PATIENCE", 1.0)
+    monkeypatch.setattr(parallel, "SCHEDULER_TIMEOUT_SECONDS", 1.0)
     with socket.create_server(("127.0.0.1", 0)) as silent:  # it listens, but never says a word
         port = silent.getsockname()[1]
         for address in (f"tcp://127.0.0.1:{port}", "nonsense", "tcp://127.0.0.1:1"):
@@ -271,12 +271,12 @@ def good(study: Study) -> None:
     from matplotlib.figure import Figure
 
     table = Table(HOSTILE, ("what", HOSTILE), ((HOSTILE, 1.5), ("b", 2.0)), ("", ".2f"))
-    save_tables(study.out, study.name, [table])
+    write_tables(study.out, study.name, [table])
     figure = Figure(figsize=(1, 1))
     figure.subplots()
-    save_figure(study.out, "a picture", figure)
+    write_figure_files(study.out, "a picture", figure)
     assert study.json
-    save_json(study.json, {"seed": study.seed, "quick": study.quick, "unknown": [math.nan]})
+    write_json(study.json, {"seed": study.seed, "quick": study.quick, "unknown": [math.nan]})
 
 
 def bad(study: Study) -> None:
@@ -286,14 +286,14 @@ def bad(study: Study) -> None:
 def test_all_studies_make_one_page(tmp_path, monkeypatch, capsys):
     fake("fake_bad", monkeypatch, bad)
     fake("fake_good", monkeypatch, good)
-    monkeypatch.setattr(studies, "STUDIES", ("fake_bad", "fake_good"))
-    monkeypatch.setattr(studies, "about", lambda name: HOSTILE)
+    monkeypatch.setattr(studies, "STUDY_NAMES", ("fake_bad", "fake_good"))
+    monkeypatch.setattr(studies, "read_study_description", lambda name: HOSTILE)
     out, numbers = tmp_path / "out", tmp_path / "all.json"
     (out / "fake_good").mkdir(parents=True)
     (out / "fake_good" / "old_1.csv").write_text("of an earlier run")
     (out / "fake_good" / "old.html").write_text("<table><tr><td>stale</td></tr></table>")
     options = ["--quick", "--seed", "7", "--out", str(out), "--json", str(numbers)]
-    result = CliRunner().invoke(studies.everything, options)
+    result = CliRunner().invoke(studies.run_every_study, options)
     assert result.exit_code == 1
     assert result.stderr.splitlines()[-1] == "Error: failed: fake_bad"
     page = (out / "index.html").read_text()
@@ -315,21 +315,21 @@ def test_all_studies_make_one_page(tmp_path, monkeypatch, capsys):
         "quick": True,
         "unknown": [None],
     }
-    CliRunner().invoke(studies.everything, options)
+    CliRunner().invoke(studies.run_every_study, options)
     assert (out / "index.html").read_text() == page
 
 
 def test_studies_are_listed_and_run_by_name(monkeypatch, capsys, tmp_path):
     studies.main([])
     listed = capsys.readouterr().out
-    for name in studies.STUDIES:
+    for name in studies.STUDY_NAMES:
         assert re.search(rf"^  {name} +\w.{{30,}}$", listed, re.MULTILINE), name
     with pytest.raises(SystemExit) as ended:
         studies.main(["speeed"])
     assert ended.value.code == 2
     assert capsys.readouterr().err.startswith("error: no study 'speeed'")
     fake("fake_good", monkeypatch, good)
-    monkeypatch.setattr(studies, "STUDIES", ("fake_good",))
+    monkeypatch.setattr(studies, "STUDY_NAMES", ("fake_good",))
     with pytest.raises(SystemExit) as ended:
         studies.main(["fake_good", "--out", str(tmp_path), "--json", str(tmp_path / "x.json")])
     assert ended.value.code == 0
@@ -373,7 +373,7 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     folder = tmp_path_factory.mktemp("cluster")
     patched = pytest.MonkeyPatch.context()
     with dask(folder, *size, **failures) as (address, _), patched as patch:
-        patch.setattr(parallel, "PATIENCE", 60.0)  # a loaded machine answers late
+        patch.setattr(parallel, "SCHEDULER_TIMEOUT_SECONDS", 60.0)  # a loaded machine answers late
         yield address
 
 
@@ -409,7 +409,7 @@ def test_a_diagnosis_is_what_one_process_finds(cluster):
 
 
 def test_a_cluster_with_other_code_is_refused(cluster, tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "fingerprint", lambda function: "other")
+    monkeypatch.setattr(module, "code_fingerprint", lambda function: "other")
     with pytest.raises(OptionError, match="other code"):
         sweep(work, JOBS, name="other", cluster=cluster, folder=tmp_path)
 
@@ -435,9 +435,9 @@ def test_a_job_that_kills_its_worker_ends_the_sweep(cluster, tmp_path):
 
 @pytest.mark.parametrize("dead", ["worker", "scheduler"])
 def test_a_deserted_cluster_is_not_waited_for(dead, tmp_path, monkeypatch):
-    monkeypatch.setattr(parallel, "PATIENCE", 60.0)
-    monkeypatch.setattr(parallel, "DESERTED", 1.0)
-    monkeypatch.setattr(parallel, "WATCH", 0.2)
+    monkeypatch.setattr(parallel, "SCHEDULER_TIMEOUT_SECONDS", 60.0)
+    monkeypatch.setattr(parallel, "MAX_SECONDS_WITHOUT_WORKERS", 1.0)
+    monkeypatch.setattr(parallel, "CLUSTER_POLL_SECONDS", 0.2)
     jobs = [Job(seed, str(tmp_path / "log"), 0.3) for seed in range(100)]
     with dask(tmp_path, "--no-nanny", "--nthreads", "1") as (address, running):
 

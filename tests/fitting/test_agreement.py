@@ -17,35 +17,35 @@ from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
 from experiments.agreement import (
-    BASE,
-    EFFECTS,
-    ROBOTS,
-    SCALE,
-    ZERO,
-    Job,
-    SigmaJob,
+    AGREEMENT_ROBOTS,
+    BASE_CONTRADICTION,
+    JOINT_ZERO_CONTRADICTION,
+    SCALE_CONTRADICTION,
+    SIMULATED_EFFECTS,
+    AgreementJob,
+    PositionSigmaJob,
     SimulatedArm,
-    fitted_spot,
-    homogeneous,
-    ratio_of,
-    told_of,
+    fitted_target_position,
+    homogeneous_transform,
+    position_error_over_sigma,
+    report_contradictions,
 )
-from minimax_cal.fitting.claims import drawn_sigmas
-from minimax_cal.fitting.disagreement import Cause, Contradiction
-from minimax_cal.fitting.outcome import FileEvidence, FitEvidence, judge
-from minimax_cal.fitting.several.agreement import ScoreTest
-from minimax_cal.fitting.several.fit import fit_instruments
-from minimax_cal.fitting.several.kinds import (
-    drawn_sigma_of_positions,
+from minimax_cal.fitting.accuracy_claims import nominal_link_sigmas
+from minimax_cal.fitting.contradiction import Contradiction, ContradictionCause
+from minimax_cal.fitting.multi_instrument.agreement import ScoreTest
+from minimax_cal.fitting.multi_instrument.instrument_fit import fit_instruments
+from minimax_cal.fitting.multi_instrument.lack import Components, FileRows, with_lack
+from minimax_cal.fitting.multi_instrument.options import RelativeOptions, silent_progress
+from minimax_cal.fitting.multi_instrument.relative_calibration import (
+    calibrated_position_sigma_of_instruments,
+    first_instrument_targets,
+    nominal_position_sigma_of_instruments,
     relative,
-    sigma_of_positions,
-    targets_of,
 )
-from minimax_cal.fitting.several.lack import Components, FileRows, with_lack
-from minimax_cal.fitting.several.options import RelativeOptions, silent
+from minimax_cal.fitting.outcome import FileEvidence, FitEvidence, judge
 from minimax_cal.instruments import Surface, contacts, distances
 from minimax_cal.instruments.instrument import bare
-from minimax_cal.measuring.history import joint_rates
+from minimax_cal.measuring.visit_history import joint_rates
 from minimax_cal.solvers.status import Status
 
 DISAGREE = SHARED / "reports" / "files_disagree.py"
@@ -54,13 +54,13 @@ DISAGREE = SHARED / "reports" / "files_disagree.py"
 @pytest.mark.parametrize("seed", [2, 6, 9, 14])
 def test_files_that_agree_are_no_contradiction(seed):
     """Of arms that bend, of files that see other joint ranges, or both."""
-    assert told_of(Job(seed)).status == "converged"
+    assert report_contradictions(AgreementJob(seed)).status == "converged"
 
 
-@pytest.mark.parametrize("cause", [SCALE, ZERO])
+@pytest.mark.parametrize("cause", [SCALE_CONTRADICTION, JOINT_ZERO_CONTRADICTION])
 @pytest.mark.parametrize("seed", [10_001, 10_003, 10_005])
 def test_what_differs_between_files_is_named(seed, cause):
-    told = told_of(Job(seed, cause))
+    told = report_contradictions(AgreementJob(seed, cause))
     assert told.status == "contradictory"
     assert told.right
     assert told.p < 1e-4
@@ -68,28 +68,34 @@ def test_what_differs_between_files_is_named(seed, cause):
 
 @pytest.mark.parametrize("seed", [10_001, 10_003, 10_005])
 def test_a_base_that_moved_between_files_of_one_frame_is_named(seed):
-    told = told_of(Job(seed, BASE))
+    told = report_contradictions(AgreementJob(seed, BASE_CONTRADICTION))
     assert told.status == "contradictory"
     assert told.right
     assert told.p < 1e-4
 
 
 MOVED = np.array([2e-3, -1e-3, 0.5e-3])  # of the base [m]
-STOOD = homogeneous(Rotation.from_rotvec([0.3, -0.5, 1.1]).as_matrix(), np.array([1.0, -2.0, 0.5]))
-GREW = homogeneous(np.eye(3), np.array([0.0, 0.0, 1e-4]))
-ELSEWHERE = homogeneous(np.eye(3), np.array([0.5, 0.3, 0.0]))
+STOOD = homogeneous_transform(
+    Rotation.from_rotvec([0.3, -0.5, 1.1]).as_matrix(), np.array([1.0, -2.0, 0.5])
+)
+GREW = homogeneous_transform(np.eye(3), np.array([0.0, 0.0, 1e-4]))
+ELSEWHERE = homogeneous_transform(np.eye(3), np.array([0.5, 0.3, 0.0]))
 
 
-@pytest.mark.parametrize("after", [np.eye(4), ELSEWHERE, GREW, homogeneous(np.eye(3), MOVED)])
+@pytest.mark.parametrize(
+    "after", [np.eye(4), ELSEWHERE, GREW, homogeneous_transform(np.eye(3), MOVED)]
+)
 def test_how_far_a_base_moved_is_told_of_whole_poses(after):
     arm = SimulatedArm(mc.load_robot("irb2600"), np.random.default_rng(3), "leaning", 2e-4)
     bases = STOOD, STOOD @ after
-    files = [arm.measure("poses", 60, 2e-5, base=base, narrow=True) for base in bases]
+    files = [
+        arm.simulate_measurement("poses", 60, 2e-5, base_pose=base, narrow=True) for base in bases
+    ]
     found = relative(arm.robot, files)
     if np.allclose(after[:3, 3], MOVED):
         assert str(found.status) == "contradictory"
         (one,) = found.contradictions
-        assert one.cause.kind == BASE
+        assert one.cause.kind == BASE_CONTRADICTION
         assert one.cause.by == pytest.approx(np.linalg.norm(MOVED), abs=2e-4)
         assert one.sentence in found.notices
     else:  # it stood still, grew in the sun, or the instrument was set up elsewhere
@@ -97,14 +103,14 @@ def test_how_far_a_base_moved_is_told_of_whole_poses(after):
         assert not found.contradictions
 
 
-@pytest.mark.parametrize("after", [np.eye(4), ELSEWHERE, homogeneous(np.eye(3), MOVED)])
+@pytest.mark.parametrize("after", [np.eye(4), ELSEWHERE, homogeneous_transform(np.eye(3), MOVED)])
 def test_a_base_that_moved_between_sessions_contradicts_nothing(after):
     """Sessions say that something may have moved: a notice has by how much."""
     rng = np.random.default_rng(3)
     arm = SimulatedArm(mc.load_robot("irb2600"), rng, "leaning", 2e-4)
-    q = arm.joints(120, narrow=True)
+    q = arm.draw_joint_values(120, in_narrow_range=True)
     bases = np.repeat([STOOD, STOOD @ after], 60, axis=0)
-    y = (bases @ arm.pose(q) @ [0.06, -0.04, 0.1, 1.0])[:, None, :3]
+    y = (bases @ arm.flange_poses(q) @ [0.06, -0.04, 0.1, 1.0])[:, None, :3]
     y += 2e-5 * rng.normal(size=y.shape)
     data = mc.measurements(q, y, session=np.repeat(["A", "B"], 60))
     fit = mc.calibrate(arm.robot, data, "sum")
@@ -118,8 +124,19 @@ def test_a_base_that_moved_between_sessions_contradicts_nothing(after):
 
 @pytest.mark.slow
 def test_of_many_files_few_contradict_in_vain_and_most_causes_are_named():
-    assert sum(told_of(Job(seed)).status == "contradictory" for seed in range(40)) <= 1
-    told = [told_of(Job(10_000 + i, (SCALE, ZERO)[i % 2])) for i in range(20)]
+    assert (
+        sum(
+            report_contradictions(AgreementJob(seed)).status == "contradictory"
+            for seed in range(40)
+        )
+        <= 1
+    )
+    told = [
+        report_contradictions(
+            AgreementJob(10_000 + i, (SCALE_CONTRADICTION, JOINT_ZERO_CONTRADICTION)[i % 2])
+        )
+        for i in range(20)
+    ]
     assert sum(one.status == "contradictory" for one in told) >= 17
     assert sum(one.right for one in told) >= 14
 
@@ -128,7 +145,9 @@ def test_of_many_files_few_contradict_in_vain_and_most_causes_are_named():
 @pytest.mark.parametrize("bends", [False, True])
 @pytest.mark.parametrize("kinds", [("wires",), ("tracker", "poses")])
 def test_sigmas_of_positions_are_true_on_arms_that_bend(kinds, bends):
-    median = np.median([ratio_of(SigmaJob(seed, kinds, bends)) for seed in range(8)])
+    median = np.median(
+        [position_error_over_sigma(PositionSigmaJob(seed, kinds, bends)) for seed in range(8)]
+    )
     assert (0.6 if bends else 0.7) < median < (1.6 if bends else 1.4)
 
 
@@ -144,7 +163,7 @@ def recorded(arm, late, count=150, step=0.1):
     rate, phase, size = (rng.uniform(*ends, n) for ends in ((0.3, 1.2), (0.0, 6.28), (0.5, 1.0)))
     middle = 0.5 * (np.maximum(arm.robot.lower, -np.pi) + np.minimum(arm.robot.upper, np.pi))
     q, moved = (middle + size * np.sin(rate * t[:, None] + phase) for t in (time, time + late))
-    place = (arm.pose(moved) @ [0.06, -0.04, 0.1, 1.0])[:, None, :3]
+    place = (arm.flange_poses(moved) @ [0.06, -0.04, 0.1, 1.0])[:, None, :3]
     length = np.linalg.norm(place - ANCHORS, axis=-1)
     return distances(q, length + 3e-5 * rng.normal(size=length.shape), time=time)
 
@@ -153,7 +172,9 @@ def recorded(arm, late, count=150, step=0.1):
 @pytest.mark.parametrize("late", [0.0, 0.003, -0.01])
 def test_a_file_measured_by_another_clock_is_named(effect, late):
     arm = SimulatedArm(mc.load_robot("irb2600"), np.random.default_rng(1), effect, 2e-4)
-    found = relative(arm.robot, [arm.measure("tracker", 50, 3e-5), recorded(arm, late)])
+    found = relative(
+        arm.robot, [arm.simulate_measurement("tracker", 50, 3e-5), recorded(arm, late)]
+    )
     if not late:
         assert str(found.status) == "converged"
         assert not found.contradictions
@@ -176,9 +197,12 @@ def test_poses_at_which_the_arm_stood_have_no_clock(rng):
 def bent_arm(seed):
     """An arm whose effect moves it by more than its drawing is off, and what three wires say."""
     rng = np.random.default_rng([seed, 9])
-    robot, effect = mc.load_robot(ROBOTS[seed % len(ROBOTS)]), EFFECTS[seed % len(EFFECTS)]
+    robot, effect = (
+        mc.load_robot(AGREEMENT_ROBOTS[seed % len(AGREEMENT_ROBOTS)]),
+        SIMULATED_EFFECTS[seed % len(SIMULATED_EFFECTS)],
+    )
     arm = SimulatedArm(robot, rng, effect, 2e-3)
-    return arm, arm.measure("wires", 60, 3e-5, narrow=seed % 2 == 0)
+    return arm, arm.simulate_measurement("wires", 60, 3e-5, narrow=seed % 2 == 0)
 
 
 @pytest.mark.parametrize("seed", [1, 17])
@@ -187,8 +211,8 @@ def test_a_bent_arm_is_held_against_a_drawn_one_that_bends_as_much(seed):
     arm, lengths = bent_arm(seed)
     found = relative(arm.robot, lengths)
     assert str(found.status) == "converged"
-    off = arm.position_error(found.robot, fitted_spot(found))
-    assert off < arm.position_error(arm.robot, arm.spots[0])
+    off = arm.rms_position_error(found.robot, fitted_target_position(found))
+    assert off < arm.rms_position_error(arm.robot, arm.spots[0])
     assert 0.6 * found.position_sigma < off < 1.6 * found.position_sigma
     # wires that tell the arm to a tenth of how it bends are no poor instrument
     assert not any("positions are poorly determined" in notice for notice in found.notices)
@@ -201,14 +225,16 @@ def test_positions_of_a_drawn_arm_that_bends_are_claimed_as_they_are():
     for seed in range(16):
         arm, lengths = bent_arm(seed)
         fit = with_lack(
-            arm.robot, fit_instruments(arm.robot, {"": lengths}, RelativeOptions(), silent)
+            arm.robot, fit_instruments(arm.robot, {"": lengths}, RelativeOptions(), silent_progress)
         )
-        drawn = arm.position_error(arm.robot, arm.spots[0])
-        claimed = drawn_sigma_of_positions(arm.robot, fit, drawn_sigmas(arm.robot))
+        drawn = arm.rms_position_error(arm.robot, arm.spots[0])
+        claimed = nominal_position_sigma_of_instruments(
+            arm.robot, fit, nominal_link_sigmas(arm.robot)
+        )
         ratio.append(drawn / claimed)
-        (spot,) = targets_of(fit, fit.state)
-        fitted = arm.position_error(arm.robot.with_mdh(fit.state.mdh), spot)
-        is_kept = sigma_of_positions(arm.robot, fit) > claimed
+        (spot,) = first_instrument_targets(fit, fit.state)
+        fitted = arm.rms_position_error(arm.robot.with_mdh(fit.state.mdh), spot)
+        is_kept = calibrated_position_sigma_of_instruments(arm.robot, fit) > claimed
         right.append(is_kept == (fitted > drawn))
     assert 0.7 < np.median(ratio) < 1.4
     assert sum(right) >= 12
@@ -217,12 +243,15 @@ def test_positions_of_a_drawn_arm_that_bends_are_claimed_as_they_are():
 def two_files(rng, robot, **wrong):
     """A tracker and wires of an arm; wrong: of the wires."""
     arm = SimulatedArm(robot, rng)
-    return [arm.measure("tracker", 40, 2e-5), arm.measure("wires", 60, 2e-5, **wrong)]
+    return [
+        arm.simulate_measurement("tracker", 40, 2e-5),
+        arm.simulate_measurement("wires", 60, 2e-5, **wrong),
+    ]
 
 
 def test_a_contradiction_keeps_the_drawn_arm_and_comes_back(tmp_path, refuses):
     robot = mc.load_robot("irb2600")
-    found = relative(robot, two_files(np.random.default_rng(3), robot, factor=1.001))
+    found = relative(robot, two_files(np.random.default_rng(3), robot, length_factor=1.001))
     assert found.status == "contradictory"
     assert found.robot is robot
     (one,) = found.contradictions
@@ -244,7 +273,7 @@ def test_a_contradiction_keeps_the_drawn_arm_and_comes_back(tmp_path, refuses):
 def test_a_joint_whose_zero_moved_between_files_is_named():
     robot = mc.load_robot("irb2600")
     moved = 1e-3 * np.eye(6)[2]
-    found = relative(robot, two_files(np.random.default_rng(3), robot, zeros=moved))
+    found = relative(robot, two_files(np.random.default_rng(3), robot, joint_zero_errors=moved))
     (one,) = found.contradictions
     assert (one.cause.kind, one.cause.place, one.cause.unit) == ("joint_zero", "J3", "rad")
     assert_allclose(one.cause.by, 1e-3, atol=5e-5)
@@ -365,6 +394,6 @@ def test_the_report_of_files_that_disagree(tmp_path, capsys):
 
 
 def test_a_cause_is_a_sentence():
-    cause = Cause("scale", "wires", -2e-3, "1")
+    cause = ContradictionCause("scale", "wires", -2e-3, "1")
     assert "0.2 % shorter" in Contradiction(("wires", "points"), 1e-9, cause).sentence
     assert "no single" in Contradiction(("wires", "points"), 1e-9).sentence

@@ -13,40 +13,52 @@ from numpy.testing import assert_allclose
 from scipy import stats
 
 import minimax_cal as mc
-from minimax_cal.fitting import beyond
+from minimax_cal.core.arrays import Array
+from minimax_cal.core.files import to_plain_json
+from minimax_cal.fitting import region_holdout
 from minimax_cal.fitting.accuracy import (
     Interval,
-    accuracy,
-    chance_of_larger,
-    max_interval,
-    rms_interval,
-    told,
-    top_of_normal,
+    bootstrap_rms_interval,
+    exceedance_probability,
+    interval_for_display,
+    predict_max_error_interval,
+    sample_largest_normals,
+    summarise_point_errors,
 )
-from minimax_cal.fitting.beyond import needed, one_step, step_without, unidentified, without
-from minimax_cal.fitting.crossed import MIN_HELD_POSES
-from minimax_cal.fitting.floor import (
+from minimax_cal.fitting.cross_validation import MIN_HELD_POSES
+from minimax_cal.fitting.joint_spans import (
+    is_outside_narrow_spans,
+    measure_joint_spans,
+    min_joint_span,
+    robust_span_width,
+    select_narrow_spans,
+)
+from minimax_cal.fitting.noise_floor import (
     AT_MOST,
     DECLARED,
     DISTANCES,
     REPEATS,
-    RMS_OF_REPEATABILITY,
-    Floor,
-    by_distances,
-    declared,
-    floor_of,
-    instrument_noise,
-    instrument_of,
-    of_coordinate,
-    with_instrument,
+    RMS_TO_REPEATABILITY_RATIO,
+    NoiseFloor,
+    declared_noise_mm,
+    estimate_noise_floor,
+    floor_from_distances,
+    instrument_coordinate_sigma,
+    parse_instrument_accuracy,
+    rms_mm_from_coordinate_sigma,
+    with_u95_of_instrument,
 )
-from minimax_cal.fitting.spans import inner_size, least_span, narrow, outside, spans_of
-from minimax_cal.fitting.uncertainty import Poses
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.files import plain
-from minimax_cal.measuring.grouping import parts
+from minimax_cal.fitting.region_holdout import (
+    is_region_needed,
+    one_step_without_regions,
+    refit_without_regions,
+    step_without_poses,
+    unidentified_without_poses,
+)
+from minimax_cal.fitting.uncertainty import PosewiseFit
 from minimax_cal.measuring.measurements import Measurements, measurements
-from minimax_cal.modelling.model import moved
+from minimax_cal.measuring.pose_groups import list_holdout_regions
+from minimax_cal.modelling.point_model import apply_active_step
 from minimax_cal.modelling.simulate import Simulation, Truth, simulate
 
 # ---- beyond --------------------------------------------------------------------------------------
@@ -57,7 +69,7 @@ def test_a_part_is_judged_by_a_fit_without_it(robot, noisy, objective):
     fit = mc.calibrate(robot, noisy.data, objective, holdout=0.0)
     found = fit.beyond
     fold = found.folds[0]
-    part = next(p for p in parts(fit.data) if p.name == fold.where)
+    part = next(p for p in list_holdout_regions(fit.data) if p.name == fold.where)
     labels = np.where(part.rows, "holdout", "train")
     columns = {**noisy.data.columns, "split": labels}
     fresh = mc.calibrate(robot, replace(noisy.data, columns=columns), objective)
@@ -68,7 +80,7 @@ def test_a_part_is_judged_by_a_fit_without_it(robot, noisy, objective):
     assert_allclose(found.typical_mm**2, (poses * rms**2).sum() / poses.sum(), rtol=1e-12)
     assert found.worst_mm == found.worst.rms_mm == max(rms)
     assert len(found.spans) == 6
-    assert (found.narrow, plain(found)["plan"]) == ((), None)
+    assert (found.narrow_spans, to_plain_json(found)["plan"]) == ((), None)
 
 
 def test_effects_stand_beside_geometry_alone(robot):
@@ -108,11 +120,13 @@ def test_parts_that_effects_alone_need_are_judged_as_a_calibration_of_the_rest_w
     """Without one end of joint 6 its gear's harmonics are not told: the rest gives them up."""
     data, gear = one_end(robot), ("gear_error:J6:orders=3",)
     fit = mc.calibrate(robot, data, "sum", effects=gear)
-    lost = Poses(fit.estimator, fit.cell.state)
-    every = {part.name: part.rows for part in parts(fit.data)}
+    lost = PosewiseFit(fit.estimator, fit.cell.parameter_values)
+    every = {part.name: part.rows for part in list_holdout_regions(fit.data)}
     assert [fold.where for fold in fit.beyond.folds] == list(every)
     assert fit.beyond.missed == ()
-    asked = [fold for fold in fit.beyond.folds if needed(lost, every[fold.where][~fit.held])]
+    asked = [
+        fold for fold in fit.beyond.folds if is_region_needed(lost, every[fold.where][~fit.held])
+    ]
     assert "joint 6 at its high end" in [fold.where for fold in asked]
     for fold in asked:
         rows = every[fold.where]
@@ -140,21 +154,23 @@ def test_parts_that_none_can_judge_are_counted_and_named(robot):
         in found.sentence()
     )
     assert found.table().rows[-1][0] == f"{len(found.folds)} of {made} parts"
-    assert plain(found)["not_judged"] == list(found.missed)
-    assert plain(found)["effects_sought_anew"] is None
+    assert to_plain_json(found)["not_judged"] == list(found.missed)
+    assert to_plain_json(found)["effects_sought_anew"] is None
 
 
 @pytest.mark.parametrize("seed", [2, 5])
 def test_no_part_left_out_makes_a_joint_yield_upwards(seed, monkeypatch):
     """Compliances near 0: one step from the whole fit would go below in some parts."""
-    found, steps, plain = [], [], beyond.fit_of_rest
+    found, steps, plain = [], [], region_holdout.fit_remaining_poses
 
-    def looked(poses: Poses, part: Array, gone: Array) -> Any:
+    def looked(poses: PosewiseFit, part: Array, gone: Array) -> Any:
         found.append(plain(poses, part, gone))
-        steps.append(moved(poses.estimator.model, poses.state, step_without(poses, part)))
+        steps.append(
+            apply_active_step(poses.estimator.model, poses.state, step_without_poses(poses, part))
+        )
         return found[-1]
 
-    monkeypatch.setattr(beyond, "fit_of_rest", looked)
+    monkeypatch.setattr(region_holdout, "fit_remaining_poses", looked)
     sim = simulate("irb120", 40, 3, seed=seed, truth=Truth(compliance=1e-6))
     mc.calibrate("irb120", sim.data, "sum", effects=["joint_compliance:all"])
     compliances = [
@@ -249,15 +265,17 @@ def test_every_pose_is_judged_by_a_fit_without_it(robot, noisy):
         other = mc.Measurements(**{**vars(noisy.data), "columns": {"split": label}})
         again = mc.calibrate(robot, other, "sum").cell.error(noisy.data.take(rows))
         assert_allclose(
-            accuracy(fit.error_crossed[rows]).rms_mm, accuracy(again).rms_mm, rtol=ONE_STEP
+            summarise_point_errors(fit.error_crossed[rows]).rms_mm,
+            summarise_point_errors(again).rms_mm,
+            rtol=ONE_STEP,
         )
 
 
 def _by_group(fit: mc.Fit, folds: np.ndarray) -> np.ndarray:
     """(training poses,) the fold of each, by the order of its joints."""
-    from minimax_cal.measuring.grouping import clusters
+    from minimax_cal.measuring.pose_groups import cluster_poses
 
-    group = clusters(fit.data)
+    group = cluster_poses(fit.data)
     return folds[np.searchsorted(np.unique(group[~fit.held]), group[~fit.held])]
 
 
@@ -267,7 +285,9 @@ def test_few_held_out_poses_are_cross_validated(robot):
     assert told.accuracy["holdout"].poses < MIN_HELD_POSES
     assert any("the result is cross-validated" in notice for notice in told.notices)
     assert "60 poses, each judged by a fit without it" in told.headline()
-    assert_allclose(told.within.after.rms_mm, accuracy(told.error_crossed).rms_mm, rtol=1e-12)
+    assert_allclose(
+        told.within.after.rms_mm, summarise_point_errors(told.error_crossed).rms_mm, rtol=1e-12
+    )
     plain = mc.calibrate(robot, many, "sum")
     assert not plain.error_crossed.size
     assert "20 poses that were not used for the fit" in plain.headline()
@@ -303,7 +323,7 @@ def rng_of(seed: int = 0) -> np.random.Generator:
 
 def both(error: Array, seed: int = 0) -> Array:
     """Ends of both intervals, (4,)."""
-    out = [f(error, rng=rng_of(seed)) for f in (rms_interval, max_interval)]
+    out = [f(error, rng=rng_of(seed)) for f in (bootstrap_rms_interval, predict_max_error_interval)]
     return np.array([end for interval in out for end in (interval.low, interval.high)])
 
 
@@ -335,8 +355,8 @@ def test_what_was_not_measured_does_not_count(rng):
 def test_too_few_poses_tell_nothing():
     for m in range(3):
         assert np.isnan(both(np.ones((m, 2, 3)))).all()
-    assert rms_interval(np.zeros((5, 1, 3)), rng=rng_of()) == Interval(0.0, 0.0)
-    assert max_interval(np.zeros((5, 1, 3)), rng=rng_of()) == Interval(0.0, 0.0)
+    assert bootstrap_rms_interval(np.zeros((5, 1, 3)), rng=rng_of()) == Interval(0.0, 0.0)
+    assert predict_max_error_interval(np.zeros((5, 1, 3)), rng=rng_of()) == Interval(0.0, 0.0)
 
 
 @pytest.mark.parametrize(("m", "zero"), [(12, 6), (7, 6), (400, 399)])
@@ -345,26 +365,31 @@ def test_exact_zeros_are_the_smallest_errors(m, zero):
     error = rng_of(5).normal(size=(m, 1, 3))
     error[:zero] = 0.0
     found, tiny = (
-        rms_interval(errors, rng=rng_of())
+        bootstrap_rms_interval(errors, rng=rng_of())
         for errors in (error, np.where(error == 0.0, 1e-12, error))
     )
     rms = np.sqrt((error**2).sum() / m)
     assert 0.0 < found.low < rms < found.high
     assert_allclose([found.low, found.high], [tiny.low, tiny.high], rtol=1e-9)
-    assert np.isnan(told(found, rms).high) == (m == zero + 1)  # one pose is all of the error
+    assert np.isnan(interval_for_display(found, rms).high) == (
+        m == zero + 1
+    )  # one pose is all of the error
 
 
 def test_an_upper_end_of_the_law_alone_is_not_told():
     """Seven poses of which one is nearly all of the error: no sample without it tells anything."""
     error = np.zeros((7, 1, 3))
     error[:, 0, 0] = [2.09, 0.31, 0.35, 0.4, 0.29, 0.38, 0.33]
-    for interval, seen in ((rms_interval, np.sqrt((error**2).sum() / 7)), (max_interval, 2.09)):
+    for interval, seen in (
+        (bootstrap_rms_interval, np.sqrt((error**2).sum() / 7)),
+        (predict_max_error_interval, 2.09),
+    ):
         found = interval(error, rng=rng_of())
         assert found.high > 10.0 * seen
-        assert told(found, seen).low == found.low
-        assert np.isnan(told(found, seen).high)
+        assert interval_for_display(found, seen).low == found.low
+        assert np.isnan(interval_for_display(found, seen).high)
     for end, said in ((2.0, 2.0), (0.9, 1.0)):  # never below what was seen
-        assert told(Interval(0.5, end), 1.0) == Interval(0.5, said)
+        assert interval_for_display(Interval(0.5, end), 1.0) == Interval(0.5, said)
 
 
 @settings(max_examples=40, deadline=None)
@@ -384,7 +409,7 @@ def test_exact_poses_count_as_nearly_exact_ones(m, data):
 def test_many_normal_errors_give_the_chi_square_interval(rng):
     """3m normal coordinates of one variance: its exact interval, within 10 % of its width."""
     error = rng.normal(size=(2000, 1, 3))
-    found = rms_interval(error, rng=rng_of())
+    found = bootstrap_rms_interval(error, rng=rng_of())
     total, free = float((error**2).sum()), 6000
     exact = np.sqrt(total / stats.chi2.ppf([0.975, 0.025], free) * 3.0)
     assert_allclose([found.low, found.high], exact, rtol=0, atol=0.1 * np.ptp(exact))
@@ -392,7 +417,7 @@ def test_many_normal_errors_give_the_chi_square_interval(rng):
 
 def test_a_wider_level_is_wider(rng):
     error = rng.normal(size=(12, 3, 3))
-    for interval in (rms_interval, max_interval):
+    for interval in (bootstrap_rms_interval, predict_max_error_interval):
         wide, narrow = (interval(error, level=v, rng=rng_of()) for v in (0.99, 0.8))
         assert wide.low < narrow.low < narrow.high < wide.high
 
@@ -416,7 +441,7 @@ def test_the_rms_interval_covers(name):
     for _ in range(RUNS):
         error = np.zeros((poses, 1, 3))
         error[:, 0, 1] = np.sqrt(law(rng, poses))
-        found = rms_interval(error, rng=rng)
+        found = bootstrap_rms_interval(error, rng=rng)
         held += found.low <= np.sqrt(mean) <= found.high
     assert 0.95 - loss - CHANCE < held / RUNS < 0.95 + loss + CHANCE
 
@@ -432,7 +457,7 @@ def test_the_largest_of_new_poses_is_covered(name, poses):
             distance = np.sqrt(rng.chisquare(3, 2 * poses))
         error = np.zeros((poses, 1, 3))
         error[:, 0, 2] = distance[:poses]
-        found = max_interval(error, rng=rng)
+        found = predict_max_error_interval(error, rng=rng)
         held += found.low <= distance[poses:].max() <= found.high
     more = 0.0 if name == "exact" else 0.03
     assert 0.95 - CHANCE < held / RUNS < 0.95 + more + CHANCE
@@ -443,7 +468,7 @@ def test_chance_of_a_larger_error_is_free_of_the_law(rng):
     runs, n = 20000, 14
     for sample in (rng.standard_cauchy((runs, n + 1)), rng.uniform(size=(runs, n + 1))):
         share = float(np.mean(sample[:, n] > sample[:, :n].max(axis=1)))
-        p_value = chance_of_larger(n)
+        p_value = exceedance_probability(n)
         assert abs(share - p_value) < 4.0 * np.sqrt(p_value / runs)
 
 
@@ -451,21 +476,24 @@ def test_the_search_goes_on_where_one_step_does_not_arrive(robot):
     data = one_end(robot, 36, half=0.5)
     effects = ("gear_error:J5:orders=3", "gear_error:J6:orders=3")
     fit = mc.calibrate(robot, data, "sum", effects=effects)
-    estimator, state = fit.estimator, fit.cell.state
-    poses, far = Poses(estimator, state), 0
-    effects_of = np.flatnonzero(estimator.model.active) >= estimator.model.names.geometric
-    for part in (part.rows[~fit.held] for part in parts(fit.data)):
-        near = moved(estimator.model, state, step_without(poses, part))
+    estimator, state = fit.estimator, fit.cell.parameter_values
+    poses, far = PosewiseFit(estimator, state), 0
+    effects_of = np.flatnonzero(estimator.model.active) >= estimator.model.names.geometric_count
+    for part in (part.rows[~fit.held] for part in list_holdout_regions(fit.data)):
+        near = apply_active_step(estimator.model, state, step_without_poses(poses, part))
         sums = poses.sums_by_part([part])
-        if unidentified(poses, sums.gram[0], effects_of).any():
+        if unidentified_without_poses(poses, sums.gram[0], effects_of).any():
             continue
-        if one_step(poses, [part], sums, np.ones(1, dtype=bool)):
+        if one_step_without_regions(poses, [part], sums, np.ones(1, dtype=bool)):
             continue
         far += 1
-        (found,) = without(estimator, state, [part], 0)
+        (found,) = refit_without_regions(estimator, state, [part], 0)
         assert found is not None
-        there = Poses(estimator, found)
-        step, more = step_without(there, part), step_without(Poses(estimator, near), part)
+        there = PosewiseFit(estimator, found)
+        step, more = (
+            step_without_poses(there, part),
+            step_without_poses(PosewiseFit(estimator, near), part),
+        )
         motion, left = (float(one @ there.normal_matrix @ one) for one in (step, more))
         assert motion < 1e-6 * left  # a further step leads nowhere
     assert far
@@ -473,12 +501,12 @@ def test_the_search_goes_on_where_one_step_does_not_arrive(robot):
 
 def test_the_largest_of_normal_samples_follow_their_law():
     """The largest of n has the distribution Phi^n; all of n sorted are a normal sample."""
-    top = top_of_normal(12, 5, rng_of(3))
+    top = sample_largest_normals(12, 5, rng_of(3))
     assert np.all(np.diff(top, axis=1) < 0.0)
     assert stats.kstest(stats.norm.cdf(top[:, 0]) ** 12, "uniform").pvalue > 1e-3
     fifth = stats.beta(12 - 4, 5)  # the fifth largest of 12 uniform numbers
     assert stats.kstest(fifth.cdf(stats.norm.cdf(top[:, 4])), "uniform").pvalue > 1e-3
-    every = top_of_normal(6, 6, rng_of(4)).reshape(-1)
+    every = sample_largest_normals(6, 6, rng_of(4)).reshape(-1)
     assert abs(every.mean()) < 4.0 / np.sqrt(len(every))
     assert abs(every.var() - 1.0) < 4.0 * np.sqrt(2.0 / len(every))
 
@@ -497,12 +525,12 @@ ERROR = 1e-3 * np.array(
 
 
 def test_all_points_and_each_target():
-    found = accuracy(ERROR)
+    found = summarise_point_errors(ERROR)
     assert found.rms_mm == pytest.approx(math.sqrt(34.0 / 5.0), rel=1e-14)
     assert (found.max_mm, found.mean_mm) == pytest.approx((5.0, 2.0), rel=1e-14)
     assert (found.poses, found.counts, found.worst) == (3, (2, 3), (0, 0))
     assert found.sse_mm2 == pytest.approx((25.0, 9.0), rel=1e-14)
-    assert found.by_target() == pytest.approx((math.sqrt(12.5), math.sqrt(3.0)), rel=1e-14)
+    assert found.rms_by_target() == pytest.approx((math.sqrt(12.5), math.sqrt(3.0)), rel=1e-14)
     one, other, every = found.table("title", ("smr1", "smr2")).rows
     assert one[:3] == ("smr1", 2, pytest.approx(math.sqrt(12.5)))
     assert other[:3] == ("smr2", 3, pytest.approx(math.sqrt(3.0)))
@@ -512,9 +540,9 @@ def test_all_points_and_each_target():
 
 
 def test_no_point_is_no_number():
-    found = accuracy(np.full((0, 2, 3), np.nan))
+    found = summarise_point_errors(np.full((0, 2, 3), np.nan))
     assert (found.poses, found.counts, found.worst) == (0, (0, 0), (-1, -1))
-    assert all(map(math.isnan, (found.rms_mm, found.max_mm, *found.by_target())))
+    assert all(map(math.isnan, (found.rms_mm, found.max_mm, *found.rms_by_target())))
 
 
 # ---- spans ---------------------------------------------------------------------------------------
@@ -533,16 +561,16 @@ def free(robot: mc.Robot) -> mc.Robot:
 @pytest.mark.parametrize(("size", "count"), [(9.0, 6), (11.0, 0), (0.0, 6)])
 def test_a_joint_that_spans_less_than_ten_degrees_is_narrow(free, size, count):
     q = np.radians(size) * np.linspace(0.0, 1.0, 400)[:, None] + np.zeros(6)
-    assert len(narrow(spans_of(free, data_of(q)))) == count
+    assert len(select_narrow_spans(measure_joint_spans(free, data_of(q)))) == count
 
 
 def test_a_slide_needs_twenty_millimetres(free):
     slides = replace(free, prismatic=np.arange(6) == 0)
     q = np.linspace(0.0, 1.0, 400)[:, None] * [0.019, 1.0, 1.0, 1.0, 1.0, 1.0]
-    (few,) = narrow(spans_of(slides, data_of(q)))
+    (few,) = select_narrow_spans(measure_joint_spans(slides, data_of(q)))
     assert (few.joint, few.unit, few.least) == ("J1", "mm", 20.0)
     assert few.high == pytest.approx(19.0)
-    assert not narrow(spans_of(slides, data_of(1.2 * q)))
+    assert not select_narrow_spans(measure_joint_spans(slides, data_of(1.2 * q)))
 
 
 @pytest.mark.parametrize(
@@ -557,13 +585,13 @@ def test_a_slide_needs_twenty_millimetres(free):
 def test_the_range_of_a_joint_counts(free, size, least):
     half = np.full(6, np.radians(size) / 2.0)
     limited = replace(free, lower=-half, upper=half)
-    assert np.degrees(least_span(limited, 0)) == pytest.approx(least)
+    assert np.degrees(min_joint_span(limited, 0)) == pytest.approx(least)
 
 
 def test_one_or_two_poses_elsewhere_make_no_span():
-    assert inner_size(np.array([0.0, 0.0, 0.0, 0.0, 2.0, 3.0])) == 0.0
-    assert inner_size(np.array([0.0, 0.0, 0.0, 3.0, 3.0, 3.0])) == 3.0
-    assert inner_size(np.zeros(2)) == inner_size(np.zeros(0)) == 0.0
+    assert robust_span_width(np.array([0.0, 0.0, 0.0, 0.0, 2.0, 3.0])) == 0.0
+    assert robust_span_width(np.array([0.0, 0.0, 0.0, 3.0, 3.0, 3.0])) == 3.0
+    assert robust_span_width(np.zeros(2)) == robust_span_width(np.zeros(0)) == 0.0
 
 
 def test_poses_that_nothing_measured_do_not_count(free):
@@ -572,18 +600,22 @@ def test_poses_that_nothing_measured_do_not_count(free):
     whole = data_of(q)
     y = whole.y.copy()
     y[:20] = np.nan
-    assert "J1" not in [span.joint for span in narrow(spans_of(free, whole))]
-    assert "J1" in [span.joint for span in narrow(spans_of(free, whole.with_y(y)))]
+    assert "J1" not in [
+        span.joint for span in select_narrow_spans(measure_joint_spans(free, whole))
+    ]
+    assert "J1" in [
+        span.joint for span in select_narrow_spans(measure_joint_spans(free, whole.with_y(y)))
+    ]
 
 
 def test_outside_is_where_a_narrow_joint_was_not(free, rng):
     q = rng.uniform(-1.0, 1.0, (50, 6))
     q[:, 2] = 0.3
-    spans = spans_of(free, data_of(q))
+    spans = measure_joint_spans(free, data_of(q))
     asked = np.array([q[0], q[0], q[0], q[0]])
     asked[1, 2], asked[2, 0], asked[3, 2] = 0.35, 3.0, 0.305  # 5 mrad are no move
-    assert outside(spans, asked).tolist() == [False, True, False, False]
-    assert not outside((), asked).any()
+    assert is_outside_narrow_spans(spans, asked).tolist() == [False, True, False, False]
+    assert not is_outside_narrow_spans((), asked).any()
 
 
 # ---- floor ---------------------------------------------------------------------------------------
@@ -606,7 +638,7 @@ def visited(
 @pytest.mark.parametrize("times", [2, 3, 5])
 def test_visits_tell_the_noise_whatever_the_model(rng, times):
     data, error = visited(rng, times)
-    found = floor_of(data, error, np.nan, 10.0)
+    found = estimate_noise_floor(data, error, np.nan, 10.0)
     assert found.source == REPEATS
     # 600 to 3000 squares of three coordinates; a median is a little less sure than a mean
     assert_allclose(found.value, 1e3 * np.sqrt(3.0) * SIGMA, rtol=0.06)
@@ -616,7 +648,7 @@ def test_visits_tell_the_noise_whatever_the_model(rng, times):
 def test_a_few_wrong_visits_do_not_set_the_floor(rng):
     data, error = visited(rng, 2)
     error[:20] += 2e-3 * rng.normal(size=(20, 3, 3))
-    found = floor_of(data, error, np.nan, 10.0)
+    found = estimate_noise_floor(data, error, np.nan, 10.0)
     assert found.source == REPEATS
     assert_allclose(found.value, 1e3 * np.sqrt(3.0) * SIGMA, rtol=0.12)
 
@@ -625,33 +657,37 @@ def test_without_visits_or_promises_the_fit_tells_at_most(rng):
     q = rng.uniform(-2.0, 2.0, (30, 6))
     data = mc.measurements(q, rng.normal(size=(30, 1, 3)))
     error = SIGMA * rng.normal(size=(30, 1, 3))
-    assert floor_of(data, error, np.nan, 0.3) == Floor(0.3, 0.0, 0.3, AT_MOST)
-    assert floor_of(data, error, 1e-4, 0.3) == Floor(0.3, 0.0, 0.3, AT_MOST)
-    assert floor_of(data, error, 1e-3, 0.3) == Floor(0.3, 0.0, 0.3, AT_MOST)
-    told = floor_of(with_instrument(data, "0.0392mm"), error, 1e-4, 0.3)
+    assert estimate_noise_floor(data, error, np.nan, 0.3) == NoiseFloor(0.3, 0.0, 0.3, AT_MOST)
+    assert estimate_noise_floor(data, error, 1e-4, 0.3) == NoiseFloor(0.3, 0.0, 0.3, AT_MOST)
+    assert estimate_noise_floor(data, error, 1e-3, 0.3) == NoiseFloor(0.3, 0.0, 0.3, AT_MOST)
+    told = estimate_noise_floor(with_u95_of_instrument(data, "0.0392mm"), error, 1e-4, 0.3)
     assert told.source == DECLARED
-    both = np.hypot(np.sqrt(3.0) * 0.0392 / 1.959964, 0.1 * RMS_OF_REPEATABILITY)
+    both = np.hypot(np.sqrt(3.0) * 0.0392 / 1.959964, 0.1 * RMS_TO_REPEATABILITY_RATIO)
     assert_allclose(told.value, both, rtol=1e-6)
     assert told.low < told.value
 
 
 def test_no_floor_is_above_what_a_model_leaves():
-    assert Floor(1.79, 0.0, 1.79, AT_MOST).beneath(0.273) == Floor(0.273, 0.0, 0.273, AT_MOST)
-    assert Floor(0.1, 0.05, 0.4, REPEATS).beneath(0.3) == Floor(0.1, 0.05, 0.3, REPEATS)
+    assert NoiseFloor(1.79, 0.0, 1.79, AT_MOST).limited_by_error(0.273) == NoiseFloor(
+        0.273, 0.0, 0.273, AT_MOST
+    )
+    assert NoiseFloor(0.1, 0.05, 0.4, REPEATS).limited_by_error(0.3) == NoiseFloor(
+        0.1, 0.05, 0.3, REPEATS
+    )
 
 
 def test_repeatability_is_mean_and_three_deviations(rng):
     distance = np.linalg.norm(rng.normal(size=(400_000, 3)), axis=1)
     promise = distance.mean() + 3.0 * distance.std()
-    assert_allclose(np.sqrt((distance**2).mean()) / promise, RMS_OF_REPEATABILITY, rtol=3e-3)
+    assert_allclose(np.sqrt((distance**2).mean()) / promise, RMS_TO_REPEATABILITY_RATIO, rtol=3e-3)
 
 
 def test_a_floor_is_drawn_between_its_ends(rng):
-    known = Floor(0.02, 0.018, 0.023, REPEATS).drawn(20_000, rng)
+    known = NoiseFloor(0.02, 0.018, 0.023, REPEATS).sample_values_mm(20_000, rng)
     assert_allclose(np.quantile(known, [0.025, 0.5, 0.975]), [0.018, 0.02, 0.023], rtol=0.01)
-    loose = Floor(0.1, 0.0, 0.1, AT_MOST)
-    assert loose.least == 0.0
-    assert_allclose(loose.drawn(20_000, rng).mean(), 0.05, rtol=0.02)
+    loose = NoiseFloor(0.1, 0.0, 0.1, AT_MOST)
+    assert loose.lower_limit_mm == 0.0
+    assert_allclose(loose.sample_values_mm(20_000, rng).mean(), 0.05, rtol=0.02)
 
 
 @pytest.mark.parametrize(
@@ -659,36 +695,38 @@ def test_a_floor_is_drawn_between_its_ends(rng):
     [("10um+2.5um/m", 1e-5, 2.5e-6), ("0.05mm", 5e-5, 0.0), (" 15 um + 6 um/m", 1.5e-5, 6e-6)],
 )
 def test_an_instrument_in_words(text, base, more):
-    told = instrument_of(text)
+    told = parse_instrument_accuracy(text)
     assert_allclose([told.base, told.per_metre], [base, more], rtol=1e-12)
 
 
 @pytest.mark.parametrize("text", ["", "10", "10 parsec", "1.2.3um", "0um", "5um+3um", "2 m"])
 def test_an_instrument_that_is_none(text):
     with pytest.raises(mc.OptionError, match=r"10um\+2.5um/m"):
-        instrument_of(text)
+        parse_instrument_accuracy(text)
 
 
 def test_a_column_counts_more_than_the_option(rng):
     y = rng.normal(size=(5, 2, 3))
     bare = mc.measurements(rng.normal(size=(5, 6)), y)
-    filled = with_instrument(bare, "10um+2um/m")
+    filled = with_u95_of_instrument(bare, "10um+2um/m")
     far = np.linalg.norm(y, axis=-1).mean(axis=1)
     assert_allclose(filled.columns["u95"], 1e-5 + 2e-6 * far, rtol=1e-12)
-    kept = with_instrument(mc.measurements(bare.q, y, u95=np.full(5, 3e-5)), "10um+2um/m")
+    kept = with_u95_of_instrument(mc.measurements(bare.q, y, u95=np.full(5, 3e-5)), "10um+2um/m")
     assert_allclose(kept.columns["u95"], 3e-5)
     assert "column u95_mm is used" in kept.notices[-1]
-    assert declared(bare, np.nan) is None
-    assert np.isnan(instrument_noise(bare))
-    assert_allclose(instrument_noise(kept), 3e-5 / 1.959964, rtol=1e-6)  # of a coordinate
+    assert declared_noise_mm(bare, np.nan) is None
+    assert np.isnan(instrument_coordinate_sigma(bare))
+    assert_allclose(
+        instrument_coordinate_sigma(kept), 3e-5 / 1.959964, rtol=1e-6
+    )  # of a coordinate
 
 
 def test_a_fit_that_leaves_a_little_less_contradicts_no_distance():
     """What distances tell has an interval; what a fit leaves at most may be inside of it."""
     sigma, sure = 17e-6, 0.05
-    told = of_coordinate(sigma)
+    told = rms_mm_from_coordinate_sigma(sigma)
     for most, source in ((1.2 * told, DISTANCES), (0.97 * told, DISTANCES), (0.8 * told, AT_MOST)):
-        floor = by_distances((sigma, sure), np.nan, np.nan, most)
+        floor = floor_from_distances((sigma, sure), np.nan, np.nan, most)
         assert floor.source == source
         assert floor.low <= floor.value <= floor.high <= most
         assert floor.value == min(told, most)

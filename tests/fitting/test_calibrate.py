@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
-from minimax_cal.fitting.solve import fit_cell
+from minimax_cal.fitting.cell_fit import fit_cell
 from minimax_cal.modelling.simulate import Truth, simulate
 
 # ---- calibrate -----------------------------------------------------------------------------------
@@ -50,12 +50,16 @@ def test_minimax_lowers_the_largest_sum(robot, noisy):
 
 
 def test_pose_objective_trades_position_for_orientation(robot, noisy):
-    from experiments.poses import orientation_error, poses_of, triangle
+    from experiments.pose_fitting import (
+        fit_poses_to_points,
+        orientation_error,
+        triangle_from_distances,
+    )
 
     def turn(fit: mc.Fit) -> float:
         measured = noisy.data.y
-        shape = triangle(measured)
-        pose = [poses_of(shape, y) for y in (measured, fit.predict(noisy.data.q))]
+        shape = triangle_from_distances(measured)
+        pose = [fit_poses_to_points(shape, y) for y in (measured, fit.predict(noisy.data.q))]
         return float(np.sqrt(np.mean(orientation_error(*pose) ** 2)))
 
     total = mc.calibrate(robot, noisy.data, "sum", holdout=0.0)
@@ -464,7 +468,7 @@ def test_a_part_of_few_poses_is_judged_by_a_fit_that_has_arrived(monkeypatch):
     plain = mc.calibrate(robot, path)
     assert mc.calibrate(robot, path).beyond.reason.startswith("joint 1 spans")
     monkeypatch.setattr(
-        "minimax_cal.fitting.beyond.narrow", lambda spans: ()
+        "minimax_cal.fitting.region_holdout.select_narrow_spans", lambda spans: ()
     )  # claimed all the same
     assert [f.where for f in fit.beyond.folds] == [f.where for f in plain.beyond.folds]
     assert fit.beyond.missed == plain.beyond.missed

@@ -8,27 +8,27 @@ from numpy.testing import assert_allclose
 from problems_fit import solve
 
 import minimax_cal as mc
-from experiments.speed import identified
-from minimax_cal.fitting.found import Parameter
+from experiments.speed import identify_parameters
+from minimax_cal.core import files
+from minimax_cal.core.arrays import Array
+from minimax_cal.fitting.cell_fit import AT_BOUND_REASON
 from minimax_cal.fitting.minimax_problem import (
-    Distances,
     MinimaxProblem,
-    PointCones,
-    certify,
+    PointConeProblem,
+    TargetDistanceLimits,
+    build_certificate,
+    build_minimax_problem,
     measured_distances,
-    minimax_problem,
 )
-from minimax_cal.fitting.solve import AT_BOUND
-from minimax_cal.ground import files
-from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.history import with_history
-from minimax_cal.modelling.effects.table import Fitted, terms
-from minimax_cal.modelling.model import Model, Prior, SumOfSquares
-from minimax_cal.modelling.parameters import State
+from minimax_cal.fitting.parameter_results import Parameter
+from minimax_cal.measuring.visit_history import add_history_columns
+from minimax_cal.modelling.effects.table import Fitted, parse_effect_terms
+from minimax_cal.modelling.parameters import ParameterValues
+from minimax_cal.modelling.point_model import GaussianPrior, PointLeastSquares, PointModel
 from minimax_cal.modelling.simulate import Simulation, simulate
-from minimax_cal.robots.gravity import tubes
+from minimax_cal.robots.gravity_torques import assumed_link_masses_and_centres
 from minimax_cal.solvers import minimax
-from minimax_cal.solvers.dual_bound import Rows
+from minimax_cal.solvers.dual_bound import LinearisedNorms
 from minimax_cal.solvers.minimax import Optimum, Sqp
 from minimax_cal.solvers.status import Status
 from qp_backends import solve as solve_qp
@@ -42,16 +42,16 @@ QP = partial(solve_qp, name="daqp", tolerance=1e-10)
 @dataclass(frozen=True)
 class Setup:
     data: mc.Measurements
-    model: Model
-    start: State
-    distances: Distances
+    model: PointModel
+    start: ParameterValues
+    distances: TargetDistanceLimits
     form: str = "two-sided"
 
     @property
     def worst(self) -> MinimaxProblem:
-        return minimax_problem(self.model, self.start, self.distances, self.form, "point")
+        return build_minimax_problem(self.model, self.start, self.distances, self.form, "point")
 
-    def sqp(self, **settings: object) -> Optimum[State]:
+    def sqp(self, **settings: object) -> Optimum[ParameterValues]:
         return minimax.solve(self.worst, self.start, QP, Sqp(**settings))
 
     def value(self) -> float:
@@ -59,7 +59,7 @@ class Setup:
         return float(np.sqrt(self.sqp().value * self.worst.size))
 
 
-def linear_optimum(rows: Rows, lower: Array, upper: Array) -> tuple[Array, float]:
+def linear_optimum(rows: LinearisedNorms, lower: Array, upper: Array) -> tuple[Array, float]:
     """Step and value of min max |r_i + J_i d|, lower <= c + C d <= upper, by cvxpy."""
     n, w, p = rows.J.shape
     d, t = cp.Variable(p), cp.Variable()
@@ -73,7 +73,7 @@ def linear_optimum(rows: Rows, lower: Array, upper: Array) -> tuple[Array, float
 
 def by_cones(here: Setup) -> float:
     """The largest distance by cone programs stated for cvxpy, until it stands still [m]."""
-    points, x, value = PointCones.of(here.worst), here.start, np.inf
+    points, x, value = PointConeProblem.whiten(here.worst), here.start, np.inf
     for _ in range(20):
         rows = points.linearise(x)
         x = points.step(x, linear_optimum(rows, points.lower, points.upper)[0])
@@ -84,7 +84,7 @@ def by_cones(here: Setup) -> float:
 
 
 def setup(robot: mc.Robot, data: mc.Measurements) -> Setup:
-    model, begin = identified(robot, data)
+    model, begin = identify_parameters(robot, data)
     start = solve(model, begin).x.take(np.array(0))
     return Setup(data, model, start, measured_distances(data))
 
@@ -119,9 +119,9 @@ def weighted(robot: mc.Robot, noisy: Simulation) -> Setup:
 
 def with_prior(robot: mc.Robot, noisy: Simulation) -> Setup:
     here = setup(robot, noisy.data)
-    weight = np.zeros(here.model.names.count)
+    weight = np.zeros(here.model.names.parameter_count)
     weight[[1, 2, 8]] = 0.3, 0.3, 0.5  # a2, a3, d3: as if known to about a noise length
-    return replace(here, model=here.model.with_prior(Prior(here.model.prior.mean, weight)))
+    return replace(here, model=here.model.with_prior(GaussianPrior(here.model.prior.mean, weight)))
 
 
 CASES = {
@@ -137,7 +137,7 @@ def here(request: pytest.FixtureRequest, robot: mc.Robot, noisy: Simulation) -> 
 
 
 def test_derivatives(here):
-    problem, rng = PointCones.of(here.worst), np.random.default_rng(0)
+    problem, rng = PointConeProblem.whiten(here.worst), np.random.default_rng(0)
     at = problem.step(here.start, rng.normal(size=len(problem.white)))
     rows, step = problem.linearise(at), 1e-4
     for _ in range(3):
@@ -153,12 +153,12 @@ def test_derivatives(here):
 def test_the_certificate_closes_at_an_optimum(here, request):
     best = here.sqp()
     assert_allclose(here.value(), by_cones(here), rtol=1e-8)
-    proof = certify(here.worst, best, here.data.line)
+    proof = build_certificate(here.worst, best, here.data.line)
     assert best.status is Status.CONVERGED
     assert abs(proof.gap) < 1e-8
     assert proof.kkt.residual < 1e-7
     # the bound is right: the linearised problem's optimum by cvxpy is not below it
-    problem = PointCones.of(here.worst)
+    problem = PointConeProblem.whiten(here.worst)
     rows = problem.linearise(best.x)
     _, optimum = linear_optimum(rows, problem.lower, problem.upper)
     assert proof.bound <= optimum * np.sqrt(here.worst.size) * (1 + 1e-8)
@@ -170,18 +170,18 @@ def test_the_certificate_closes_at_an_optimum(here, request):
         assert np.abs(rows.c).max() > 1.0 - 1e-7
 
     early = here.sqp(iterations=1)
-    proof = certify(here.worst, early, here.data.line)
+    proof = build_certificate(here.worst, early, here.data.line)
     assert early.status is Status.ITERATION_LIMIT
     assert proof.gap > 1e-2
-    assert proof.bound < certify(here.worst, here.sqp(), here.data.line).value
+    assert proof.bound < build_certificate(here.worst, here.sqp(), here.data.line).value
 
 
 def test_the_points_that_decide_are_named(robot, noisy):
     here = missing(robot, noisy)
     data = replace(here.data, line=here.data.line + 100)
     best = here.sqp()
-    proof = certify(here.worst, best, data.line)
-    error = here.model.error(best.x)
+    proof = build_certificate(here.worst, best, data.line)
+    error = here.model.point_errors(best.x)
     distance = np.linalg.norm(error, axis=-1)
     assert_allclose(proof.value, np.nanmax(distance), rtol=1e-12)
     for one in proof.points:
@@ -192,7 +192,7 @@ def test_the_points_that_decide_are_named(robot, noisy):
     assert np.count_nonzero(distance > proof.value * (1 - 1e-6)) == len(proof.points)
     text = proof.table().text()
     assert f"{1e3 * proof.value:.4f} mm" in text
-    content = files.plain(proof)
+    content = files.to_plain_json(proof)
     assert content["points"][0]["line"] == proof.points[0].line
     assert_allclose(content["value_mm"], 1e3 * proof.value)
 
@@ -200,7 +200,7 @@ def test_the_points_that_decide_are_named(robot, noisy):
 def test_weights_count_in_the_value_and_not_in_the_distances(robot, noisy):
     here = weighted(robot, noisy)
     best = here.sqp()
-    proof = certify(here.worst, best, here.data.line)
+    proof = build_certificate(here.worst, best, here.data.line)
     weight = here.model.weight[
         [here.data.target_names.index(one.target) for one in proof.points],
         [int(np.flatnonzero(here.data.line == one.line)[0]) for one in proof.points],
@@ -215,7 +215,7 @@ def test_a_certificate_does_not_depend_on_the_scaling(robot, noisy):
     here = bound_by_distances(robot, noisy)
     best = here.sqp()
     again = replace(here, start=best.x).worst
-    one, two = (certify(problem, best, here.data.line) for problem in (here.worst, again))
+    one, two = (build_certificate(problem, best, here.data.line) for problem in (here.worst, again))
     assert again.size != here.worst.size
     assert_allclose(two.value, one.value, rtol=1e-12)
     assert abs(two.gap) < 1e-8
@@ -226,7 +226,7 @@ def test_a_certificate_does_not_depend_on_the_scaling(robot, noisy):
 
 def test_the_sqp_finds_its_way_from_the_nominal_arm(robot, noisy):
     """Errors of millimetres, not of the fit."""
-    model, begin = identified(robot, noisy.data)
+    model, begin = identify_parameters(robot, noisy.data)
     here = Setup(noisy.data, model, begin, measured_distances(noisy.data))
     assert_allclose(here.value(), by_cones(plain(robot, noisy)), rtol=1e-8)
 
@@ -235,9 +235,9 @@ def test_thousands_of_points(robot):
     """3000 points take the SQP no more programs than 300 do, and its answer is certified."""
     few, many = (setup(robot, simulate(robot, poses, 3, seed=1).data) for poses in (100, 1000))
     assert many.sqp().iterations <= few.sqp().iterations + 3
-    proof = certify(many.worst, many.sqp(), many.data.line)
+    proof = build_certificate(many.worst, many.sqp(), many.data.line)
     assert abs(proof.gap) < 1e-8
-    points = PointCones.of(many.worst)
+    points = PointConeProblem.whiten(many.worst)
     _, optimum = linear_optimum(points.linearise(many.sqp().x), points.lower, points.upper)
     assert_allclose(optimum * np.sqrt(many.worst.size), proof.value, rtol=1e-7)
 
@@ -248,7 +248,7 @@ def test_thousands_of_points(robot):
 EFFECTS = ("joint_compliance:J2", "joint_compliance:J3", "encoder_gain:J1")
 RISES = "joint_compliance:J3"
 IRB = mc.load_robot("irb2600")
-MASS, COM = tubes(IRB.mdh)
+MASS, COM = assumed_link_masses_and_centres(IRB.mdh)
 ARM = replace(IRB, mass=np.maximum(MASS, 1.0), com=COM)  # told: each joint has one compliance
 ALIKE, ROUGHLY = 1e-9, 3e-6  # least squares; what ends by a KKT residual
 OBJECTIVES = ("sum", "minimax", "point", "pose")
@@ -258,8 +258,8 @@ def measured(compliance: float, seed: int = 0) -> mc.Measurements:
     """An arm whose third joint gives way so much [rad/(N m)], or rises where that is negative."""
     rng = np.random.default_rng(seed)
     plain = mc.simulate(ARM, 60, seed=seed, truth=mc.Truth(compliance=0.0, noise=0.0))
-    scene = plain.cell.scene(with_history(plain.data))
-    found = terms(scene, EFFECTS)
+    scene = plain.cell.pose_arm(add_history_columns(plain.data))
+    found = parse_effect_terms(scene, EFFECTS)
     values = (np.array([1e-6]), np.array([compliance]), np.array([3e-4]))
     y = replace(plain.cell, effects=Fitted(found, values)).predict(plain.data.q)
     return mc.measurements(plain.data.q, y + 15e-6 * rng.normal(size=y.shape))
@@ -278,11 +278,11 @@ def test_a_compliance_that_would_be_negative_rests_at_0(objective, loss):
     (rests,) = of(fit, RISES)
     assert rests.value == 0.0
     assert np.isnan(rests.sigma)
-    assert (rests.identifiable, rests.reason) == (False, AT_BOUND)
+    assert (rests.identifiable, rests.reason) == (False, AT_BOUND_REASON)
     (soft,) = of(fit, "joint_compliance:J2")
     assert soft.value > 0.0
     assert soft.sigma > 0.0
-    assert AT_BOUND in fit.summary(width=200)
+    assert AT_BOUND_REASON in fit.summary(width=200)
     if loss != "square":  # its scale counts the parameter that rests
         return
     without = mc.calibrate(ARM, data, objective, effects=EFFECTS[::2])
@@ -305,10 +305,10 @@ def test_a_fit_at_its_bounds_is_the_best_between_them():
     data = measured(-1e-6)
     fit = mc.calibrate(ARM, data, "sum", effects=EFFECTS)
     model = fit.estimator.model
-    rests = model.names.geometric + 1
+    rests = model.names.geometric_count + 1
     assert not model.active[rests]
-    every = model.only(model.active | (np.arange(model.names.count) == rests))
-    _, slope, gram = SumOfSquares(every).normal(fit.cell.state)
+    every = model.with_active(model.active | (np.arange(model.names.parameter_count) == rests))
+    _, slope, gram = PointLeastSquares(every).normal(fit.cell.parameter_values)
     slope = slope / np.sqrt(np.diag(gram))
     here = np.flatnonzero(every.active) == rests
     assert slope[here] < -1e-5

@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
-from minimax_cal.fitting.checks import too_changed
-from minimax_cal.fitting.several.kinds import relative
+from minimax_cal.fitting.data_slips import describe_other_arm
+from minimax_cal.fitting.multi_instrument.relative_calibration import relative
 from minimax_cal.instruments import distances, flange_poses
 from minimax_cal.measuring.measurements import measurements
 from minimax_cal.robots.robot import robot_from_dict
@@ -126,6 +126,6 @@ def test_a_normal_that_turns_is_no_other_arm(name, joint):
     active, mdh = np.ones(30, dtype=bool), robot.mdh.copy()
     mdh[joint, 2] += 2.0
     mdh[joint + 1, 2] -= 2.0
-    assert too_changed(robot, mdh, active) == ""
+    assert describe_other_arm(robot, mdh, active) == ""
     mdh[joint, 2] += 0.6  # the sum is drawn, but where a base or a tool takes it
-    assert bool(too_changed(robot, mdh, active)) == (name == "third")
+    assert bool(describe_other_arm(robot, mdh, active)) == (name == "third")

@@ -11,18 +11,27 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import minimax_cal as mc
-from minimax_cal.fitting.set_aside import with_them
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.facts import derived_facts, facts_in_words, stored_facts
-from minimax_cal.ground.files import plain
-from minimax_cal.ground.words import capitalise
-from minimax_cal.judging.bootstrap import bootstrap
-from minimax_cal.measuring.measurements import FILE, TOOL, USER, Measurements
-from minimax_cal.measuring.set_aside import left_out, set_aside
+from minimax_cal.core.arrays import Array
+from minimax_cal.core.display_text import capitalise_sentence
+from minimax_cal.core.files import to_plain_json
+from minimax_cal.core.record_fields import (
+    derived_field_formats,
+    format_record_fields,
+    stored_field_formats,
+)
+from minimax_cal.fitting.set_aside_points import accuracy_with_set_aside
+from minimax_cal.measuring.measurements import (
+    SET_ASIDE_BY_FILE,
+    SET_ASIDE_BY_TOOL,
+    SET_ASIDE_BY_USER,
+    Measurements,
+)
+from minimax_cal.measuring.set_aside_points import set_aside_points_named_by_user, set_points_aside
 from minimax_cal.modelling.simulate import Simulation, Truth, simulate
-from minimax_cal.reporting.html import Wording, compose, read_sources, render
-from minimax_cal.serving.panels import fit_words
-from minimax_cal.serving.sessions import mark
+from minimax_cal.reporting.html import ReportRequest, build_report, read_report_sources, render_html
+from minimax_cal.validation.bootstrap import bootstrap
+from minimax_cal.webapp.page_panels import read_fit_summary
+from minimax_cal.webapp.sessions import file_version
 
 # ---- fit -----------------------------------------------------------------------------------------
 
@@ -80,7 +89,7 @@ def test_what_was_saved_comes_back(fit, saved, rng):
 def test_the_robot_is_of_geometry_alone(fit, saved, robot, noisy):
     """`robot` is what a fit without effects finds; `cell` keeps the joint fit; each stands once."""
     content = fit.to_dict()
-    joint = bool(fit.cell.effects.causes)
+    joint = bool(fit.cell.effects.cause_terms)
     assert ("robot" in content["cell"]) is joint
     assert_same(saved.robot.mdh, fit.robot.mdh)
     assert_same(saved.geometric.base, fit.geometric.base)
@@ -98,7 +107,9 @@ def test_the_robot_is_of_geometry_alone(fit, saved, robot, noisy):
 @pytest.mark.parametrize("fit", ["point", "effects", "robust"], indirect=True)
 def test_the_report_is_the_same(fit, saved):
     one, other = (
-        render(compose(read_sources([each]), Wording("2026-01-31", appendix=True)))
+        render_html(
+            build_report(read_report_sources([each]), ReportRequest("2026-01-31", appendix=True))
+        )
         for each in (fit, saved)
     )
     strip = lambda page: [x for x in page.splitlines() if "SHA" not in x and "not saved" not in x]  # noqa: E731
@@ -109,18 +120,20 @@ def test_the_report_is_the_same(fit, saved):
 def test_every_fact_is_in_the_file_and_shown_everywhere(fit, tmp_path):
     """What `Fit` declares, by its key; in words in the summary, the report and the page."""
     content = fit.to_dict()
-    facts = {**stored_facts(mc.Fit), **derived_facts(mc.Fit)}
+    facts = {**stored_field_formats(mc.Fit), **derived_field_formats(mc.Fit)}
     for name, known in facts.items():
         assert (known.key or name) in content or getattr(fit, name) is None
-    said = fit.solution()
-    assert said.startswith(capitalise(facts_in_words(fit)))
+    said = fit.describe_solution()
+    assert said.startswith(capitalise_sentence(format_record_fields(fit)))
     assert f"{fit.iterations} iterations" in said
     fit.save(tmp_path / "fit.json")
     assert said in fit.summary(10_000)
     assert said in html.unescape(
-        render(compose(read_sources([fit]), Wording("2026-01-31", appendix=True)))
+        render_html(
+            build_report(read_report_sources([fit]), ReportRequest("2026-01-31", appendix=True))
+        )
     )
-    assert said in fit_words(*mark(tmp_path / "fit.json"))
+    assert said in read_fit_summary(*file_version(tmp_path / "fit.json"))
 
 
 def test_work_goes_on_from_a_saved_fit(fit, saved):
@@ -144,14 +157,14 @@ def test_a_file_without_poses(fit, tmp_path):
     assert [p.name for p in back.parameters] == [p.name for p in fit.parameters]
     assert_same(back.parameters.value, fit.parameters.value)
     assert back.accuracy["train"].sse_mm2 == fit.accuracy["train"].sse_mm2
-    assert plain(back.beyond) == plain(fit.beyond)
+    assert to_plain_json(back.beyond) == to_plain_json(fit.beyond)
     assert not back.data.poses
     assert_same(back.predict(fit.data.q[:3]), fit.predict(fit.data.q[:3]))
 
 
 def test_a_number_changed_by_hand_counts(fit):
     content = fit.to_dict()
-    joint = content["cell"] if fit.cell.effects.causes else content
+    joint = content["cell"] if fit.cell.effects.cause_terms else content
     first = next(iter(joint["targets_mm"].values()))
     first[0] += 1.0
     moved = mc.Fit.from_dict(content).cell.target_positions - fit.cell.target_positions
@@ -237,13 +250,13 @@ def spoilt(poses: int = 250) -> tuple[Measurements, Array]:
 
 
 def unticked(data: Measurements, lines: Array) -> Measurements:
-    return left_out(data, [f"{','.join(map(str, lines))}=looks odd"])
+    return set_aside_points_named_by_user(data, [f"{','.join(map(str, lines))}=looks odd"])
 
 
 def test_points_weigh_as_much_as_they_would_among_all(rng):
     """Where a fifth is held out, a point set aside counts a fifth of a held-out one."""
     held, aside = rng.normal(size=(40, 2, 3)), 3.0 * rng.normal(size=(10, 2, 3))
-    found = with_them(held, np.arange(40), aside, 0.2)
+    found = accuracy_with_set_aside(held, np.arange(40), aside, 0.2)
     squares = [np.sum(part**2, axis=(1, 2)) for part in (held, aside)]
     mean_square = (squares[0].sum() + 0.2 * squares[1].sum()) / (80 + 0.2 * 20)
     assert_allclose(found.rms_mm, 1e3 * np.sqrt(mean_square), rtol=1e-12)
@@ -251,7 +264,7 @@ def test_points_weigh_as_much_as_they_would_among_all(rng):
     both = np.linalg.norm(np.concatenate([held, aside]), axis=-1)
     assert found.max_mm == 1e3 * both.max()
     assert (found.poses, found.counts) == (50, (50, 50))
-    alone = with_them(held, np.arange(40), aside[:0], 0.2)
+    alone = accuracy_with_set_aside(held, np.arange(40), aside[:0], 0.2)
     assert_allclose(alone.rms_mm, 1e3 * np.sqrt((held**2).sum(-1).mean()), rtol=1e-12)
 
 
@@ -263,7 +276,7 @@ def test_unticked_poses_are_listed_and_counted(tmp_path):
     assert {(p.row, p.target) for p in fit.set_aside} == {
         (line, name) for line in lines for name in data.target_names
     }
-    assert {(p.why, p.by) for p in fit.set_aside} == {("looks odd", USER)}
+    assert {(p.why, p.by) for p in fit.set_aside} == {("looks odd", SET_ASIDE_BY_USER)}
     assert fit.with_them is not None
     without, counted = fit.accuracy["holdout"], fit.accuracy["holdout_with_them"]
     noise = 1e3 * np.sqrt(3.0) * TRUTH.noise
@@ -308,7 +321,7 @@ def test_what_a_robust_fit_gives_no_weight_is_listed(options):
     fit = mc.calibrate("irb120", data, "sum", **options)
     train = set(fit.train.line)
     assert {p.row for p in fit.set_aside} == {line for line in lines if line in train}
-    assert {p.by for p in fit.set_aside} == {TOOL}
+    assert {p.by for p in fit.set_aside} == {SET_ASIDE_BY_TOOL}
     assert next(iter(options)) in fit.set_aside[0].why
 
 
@@ -318,7 +331,7 @@ def test_a_target_that_hardly_any_pose_shows_is_listed():
     y[2:, 2] = np.nan
     fit = mc.calibrate("irb120", data.with_y(y), "sum")
     assert [(p.row, p.target, p.by) for p in fit.set_aside] == [
-        (line, "smr3", TOOL) for line in data.line[:2]]  # fmt: skip
+        (line, "smr3", SET_ASIDE_BY_TOOL) for line in data.line[:2]]  # fmt: skip
     assert fit.accuracy["holdout_with_them"].rms_mm == fit.accuracy["holdout"].rms_mm or (
         fit.error_crossed.size
     )
@@ -328,9 +341,9 @@ def test_effects_and_sessions_reach_points_set_aside():
     """Their errors need the moves and the clock of the visits, which they were among."""
     data, lines = spoilt(120)
     marked = np.isin(data.line, lines)[:, None] & np.ones(3, dtype=bool)
-    some = set_aside(data, marked, "marked deleted", FILE)
+    some = set_points_aside(data, marked, "marked deleted", SET_ASIDE_BY_FILE)
     fit = mc.calibrate("irb120", some, "sum", effects=["backlash:J1", "frame_drift"])
-    assert {p.by for p in fit.set_aside} == {FILE}
+    assert {p.by for p in fit.set_aside} == {SET_ASIDE_BY_FILE}
     assert_allclose(fit.accuracy["holdout_with_them"].max_mm, 1.0, rtol=0.15)
 
 
@@ -351,7 +364,7 @@ def test_a_fit_comes_back_whole_from_another_process():
     fit = mc.calibrate("irb120", mc.simulate("irb120", 40, 1, 0).data)
     again = pickle.loads(pickle.dumps(fit))
     assert_array_equal(again.error, fit.error)
-    assert plain(again.beyond) == plain(fit.beyond)
+    assert to_plain_json(again.beyond) == to_plain_json(fit.beyond)
 
 
 def test_robots_and_data_are_as_many():

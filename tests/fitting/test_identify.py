@@ -7,24 +7,30 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
-from minimax_cal.fitting import geometry_fit, identify, unknown_arm
-from minimax_cal.fitting.identify import Because
-from minimax_cal.fitting.opened import open_result
-from minimax_cal.fitting.pose_rows import pose_rows, read_poses
-from minimax_cal.fitting.unknown_arm import SEARCH, SWEEPS, identify_arm, rough, types_of
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import DataError
+from minimax_cal.core.arrays import Array
+from minimax_cal.core.errors import DataError
+from minimax_cal.fitting import geometry_fit, identification, unknown_arm
+from minimax_cal.fitting.identification import ReasonKind
+from minimax_cal.fitting.opened_results import open_result
+from minimax_cal.fitting.pose_records import build_pose_records, parse_pose_records
+from minimax_cal.fitting.unknown_arm import (
+    SEARCH,
+    SWEEPS,
+    build_rough_robot,
+    identify_arm,
+    parse_joint_types,
+)
 from minimax_cal.measuring.measurements import measurements
-from minimax_cal.modelling import start
+from minimax_cal.modelling import global_start
 from minimax_cal.modelling.cell import Cell
-from minimax_cal.modelling.model import SumOfSquares, model_of
+from minimax_cal.modelling.global_start import CUBE_ROTATIONS, RotationProblem, fit_base_and_targets
+from minimax_cal.modelling.point_model import PointLeastSquares, build_point_model
 from minimax_cal.modelling.simulate import simulate
-from minimax_cal.modelling.start import CUBE, Turning, fit_base
 from minimax_cal.robots import kinematics
+from minimax_cal.robots.joint_sampling import random_joint_values_above_floor
 from minimax_cal.robots.kernels import plain
 from minimax_cal.robots.robot import robot_from_dict
-from minimax_cal.robots.sampling import random_poses
-from minimax_cal.robots.transforms import nearest_rotation
+from minimax_cal.robots.transforms import nearest_rotations
 
 # ---- identify ------------------------------------------------------------------------------------
 
@@ -33,15 +39,15 @@ TWELVE = "d1 theta1 d2 beta1 beta3 beta4 beta5 a6 d6 theta6 alpha6 beta6"
 
 
 def find(robot: mc.Robot, data: mc.Measurements):
-    model = model_of(robot, data)
-    frame = start.fit_base(model, robot.mdh)
-    return model, frame.state, identify.identify(
+    model = build_point_model(robot, data)
+    frame = global_start.fit_base_and_targets(model, robot.mdh)
+    return model, frame.state, identification.identify_point_parameters(
         model,
         frame.state,
-        identify.drop_order(robot, model.names),
-        allowed=model.active,
-        reference=identify.plenty_of_poses(robot, model),
-        known=np.zeros(model.names.count, dtype=bool),
+        identification.redundancy_drop_order(robot, model.names),
+        is_allowed=model.active,
+        reference_model=identification.build_reference_model(robot, model),
+        has_prior=np.zeros(model.names.parameter_count, dtype=bool),
     )  # fmt: skip
 
 
@@ -72,8 +78,8 @@ def test_beta_instead_of_d_on_parallel_axes(name, dropped):
 
 def test_singular_values_are_those_of_the_scaled_jacobian(robot, noisy):
     model, state, found = find(robot, noisy.data)
-    jacobian = model.jacobian(state).reshape(-1, model.names.count)[:, found.active]
-    norms = np.sqrt((jacobian**2).sum(axis=0) / model.counts.sum())
+    jacobian = model.point_jacobian(state).reshape(-1, model.names.parameter_count)[:, found.active]
+    norms = np.sqrt((jacobian**2).sum(axis=0) / model.pose_counts_by_target.sum())
     expected = np.linalg.svd(jacobian / norms, compute_uv=False)
     assert_allclose(found.singular, expected, rtol=1e-9)
 
@@ -82,7 +88,9 @@ def test_a_prismatic_joint_has_its_own_redundancy():
     robot = mc.load_robot("scara_600")
     data = simulate(robot, 80, 3, seed=3).data
     model, state, found = find(robot, data)
-    _, _, gram = SumOfSquares(model).normal_of(state, np.ones(model.names.count, dtype=bool))
+    _, _, gram = PointLeastSquares(model).normal_equations_of(
+        state, np.ones(model.names.parameter_count, dtype=bool)
+    )
     scale = np.sqrt(np.diag(gram))
     rank = np.linalg.matrix_rank(gram / np.outer(scale, scale), tol=1e-10, hermitian=True)
     assert found.active.sum() <= rank
@@ -102,7 +110,7 @@ def test_what_the_poses_do_not_show_is_told_from_what_no_pose_can(robot):
     assert found.active.sum() < 33
     extra = {name: why for name, why in found.reasons.items() if name not in TWELVE.split()}
     assert extra
-    assert all(why.kind is Because.NOT_TOLD for why in extra.values())
+    assert all(why.kind is ReasonKind.NOT_TOLD for why in extra.values())
 
 
 def test_a_target_on_the_last_axis_does_not_measure_the_wrist(robot):
@@ -127,7 +135,7 @@ def measured(seed: int, still: float) -> tuple[mc.Measurements, Cell]:
     """A UR10 drawn as well as `drawn_within`, joint 6 within 10 mrad in a share of 30 poses."""
     robot, rng = mc.load_robot("ur10"), np.random.default_rng(seed)
     off = rng.normal(size=(6, 5)) * np.repeat(robot.drawn_within, (2, 3))
-    q = random_poses(robot, 30, rng)
+    q = random_joint_values_above_floor(robot, 30, rng)
     q[rng.random(30) < still, 5] *= 0.01 / np.pi
     base = np.eye(4)
     base[:3, 3] = [2.0, 1.0, 0.3]
@@ -141,7 +149,7 @@ def misses(cell: Cell, true: Cell, q: Array) -> float:
     """RMS distance of points over the joints' range, the base fitted [m]."""
     here, there = (one.predict(q)[:, 0] for one in (cell, true))
     here, there = (points - points.mean(axis=0) for points in (here, there))
-    turn = nearest_rotation(there.T @ here)
+    turn = nearest_rotations(there.T @ here)
     return float(np.sqrt(((here @ turn.T - there) ** 2).sum(axis=1).mean()))
 
 
@@ -151,11 +159,11 @@ def test_a_joint_that_nearly_stands_still(seed):
     fit = mc.calibrate("ur10", data, "sum")
     assert fit.status in ("converged", "no_better")
     assert any("drawing holds them, to 0.3 mm and 0.5 mrad" in text for text in fit.notices)
-    q = random_poses(true.robot, 300, np.random.default_rng(99))
+    q = random_joint_values_above_floor(true.robot, 300, np.random.default_rng(99))
     assert misses(fit.cell, true, q) < misses(fit.nominal, true, q)
     away = np.abs(fit.cell.robot.mdh - true.robot.mdh).T.reshape(-1)
     for name in LAST:
-        i = fit.uncertainty.names.index(name)
+        i = fit.uncertainty.names.index_of_name(name)
         assert away[i] < 4.0 * fit.uncertainty.sigma[i], name
     freely = mc.calibrate("ur10", data, "sum", allow_large_changes=True)
     assert np.array_equal(freely.cell.robot.mdh, fit.cell.robot.mdh)
@@ -222,7 +230,7 @@ def tracked(kind: str, seed: int, robot: mc.Robot) -> mc.Measurements:
     mdh[:, :2] += rng.uniform(-LONGER, LONGER, size=(robot.joints, 2))
     mdh[:, 2:4] += rng.uniform(-OFF, OFF, size=(robot.joints, 2))
     spots = 0.1 * np.eye(3) + rng.normal(scale=0.02, size=(3, 3))
-    flange = kinematics.forward(mdh, robot.sign * q, robot.prismatic)
+    flange = kinematics.forward_kinematics(mdh, robot.sign * q, robot.prismatic)
     turn, move = Rotation.random(rng=rng).as_matrix(), rng.uniform(-3.0, 3.0, size=3)
     points: Array = np.einsum("mij,kj->mki", flange[:, :3, :3], spots) + flange[:, None, :3, 3]
     y = points @ turn.T + move + rng.normal(scale=GROSS_NOISE / np.sqrt(3.0), size=points.shape)
@@ -250,7 +258,7 @@ def test_a_random_arm_reaches_the_noise(kind, seed):
 def test_offsets_of_coaxial_axes_have_two_coordinates(monkeypatch):
     """Axes drawn coaxial that are not: with one coordinate the fit stops above the noise."""
     after = calibrated("coaxial neighbours", 0)
-    monkeypatch.setattr(geometry_fit, "coaxial_joints", lambda robot: [])
+    monkeypatch.setattr(geometry_fit, "find_coaxial_joints", lambda robot: [])
     before = calibrated("coaxial neighbours", 0)
     assert not at_noise(before)
     many, few = (sum(p.identifiable for p in fit.parameters) for fit in (after, before))
@@ -267,11 +275,11 @@ def test_the_only_minimum_is_the_best_of_many(rng):
         truth = Rotation.random(rng=rng).as_matrix()
         matrix = rng.normal(size=(60, 9))
         right = matrix @ truth.reshape(9) + noise * rng.normal(size=60)
-        turning = Turning(matrix, right)
-        turn, cost = turning.best()
+        turning = RotationProblem(matrix, right)
+        turn, cost = turning.solve()
         guess = np.linalg.lstsq(matrix, right, rcond=1e-9)[0].reshape(3, 3)
-        alone += turning.alone(turn, guess)
-        _, costs = plain.polish(matrix, right, CUBE.copy())
+        alone += turning.is_only_minimum(turn, guess)
+        _, costs = plain.refine_rotations(matrix, right, CUBE_ROTATIONS.copy())
         assert cost <= costs.min() * (1.0 + 1e-9)
     assert 5 < alone < 40
 
@@ -279,13 +287,13 @@ def test_the_only_minimum_is_the_best_of_many(rng):
 def test_poses_in_parts_are_all_poses(robot, noisy, monkeypatch):
     y = noisy.data.y.copy()
     y[::4, 1] = np.nan
-    model = model_of(robot, noisy.data.with_y(y))
+    model = build_point_model(robot, noisy.data.with_y(y))
     weight = model.weight * np.linspace(0.5, 2.0, len(model.q))
     model = replace(model, weight=weight)
-    whole = fit_base(model, robot.mdh)
-    monkeypatch.setattr(start, "CHUNK", 7)
-    parts = fit_base(model, robot.mdh)
-    assert_allclose(parts.state.base, whole.state.base, rtol=0, atol=1e-11)
+    whole = fit_base_and_targets(model, robot.mdh)
+    monkeypatch.setattr(global_start, "POSES_PER_QR_CHUNK", 7)
+    parts = fit_base_and_targets(model, robot.mdh)
+    assert_allclose(parts.state.base_pose, whole.state.base_pose, rtol=0, atol=1e-11)
     assert_allclose(parts.state.target_positions, whole.state.target_positions, rtol=0, atol=1e-11)
     assert parts.mean_square == pytest.approx(whole.mean_square, rel=1e-9)
 
@@ -305,7 +313,7 @@ def any_arm(rng: np.random.Generator, joints: int = 0) -> mc.Robot:
     mdh[:, 2] = rng.uniform(-3.0, 3.0, n)
     mdh[:, 3] = 0.5 * np.pi * rng.choice([0, 1, -1], n) + rng.normal(0.0, 2e-3, n)
     mdh[:, 4] = rng.normal(0.0, 2e-3, n)
-    return rough("arm", mdh, rng.uniform(size=n) < 0.12)
+    return build_rough_robot("arm", mdh, rng.uniform(size=n) < 0.12)
 
 
 def sweeps(robot: mc.Robot, rng: np.random.Generator) -> list[np.ndarray]:
@@ -388,9 +396,9 @@ def test_joints_that_never_move_alone_are_named(rng, monkeypatch):
 
 
 def test_types_of_joints():
-    assert types_of("R, prismatic,p").tolist() == [False, True, True]
+    assert parse_joint_types("R, prismatic,p").tolist() == [False, True, True]
     with pytest.raises(mc.OptionError, match="write revolute or prismatic"):
-        types_of("")
+        parse_joint_types("")
 
 
 # ---- pose rows -----------------------------------------------------------------------------------
@@ -404,8 +412,8 @@ def test_poses_come_back(rng):
     data = measurements(rng.normal(size=(7, 4)), y, pose=labels, u95=u95, order=np.arange(7)[::-1])
     data = replace(data, sliding=np.array([False, True, False, False]))
     held = np.arange(7) % 3 == 0
-    block = pose_rows(data, held, {"nominal": y})
-    back, again = read_poses(block, "fit.json")
+    block = build_pose_records(data, held, {"nominal": y})
+    back, again = parse_pose_records(block, "fit.json")
     assert_array_equal(again, held)
     assert_array_equal(back.q, data.q)
     assert_array_equal(back.sliding, data.sliding)
@@ -422,6 +430,6 @@ def test_poses_come_back(rng):
 )
 def test_broken_poses_are_named(key, value, rng):
     data = measurements(rng.normal(size=(4, 2)), rng.normal(size=(4, 3)))
-    block = pose_rows(data, np.zeros(4, dtype=bool), {}) | {key: value}
+    block = build_pose_records(data, np.zeros(4, dtype=bool), {}) | {key: value}
     with pytest.raises(DataError, match=r"fit\.json: .*"):
-        read_poses(block, "fit.json")
+        parse_pose_records(block, "fit.json")

@@ -11,10 +11,16 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
-from experiments.relative import NOISE, SPOT, Arm, inside, position_errors
-from minimax_cal.fitting.several.kinds import relative
-from minimax_cal.fitting.several.result import RelativeCalibration
-from minimax_cal.ground.arrays import Array
+from experiments.relative import (
+    RELATIVE_LENGTH_NOISE,
+    RELATIVE_TARGET_POSITION,
+    ImperfectArm,
+    is_within_limits,
+    position_errors,
+)
+from minimax_cal.core.arrays import Array
+from minimax_cal.fitting.multi_instrument.relative_calibration import relative
+from minimax_cal.fitting.multi_instrument.relative_result import RelativeCalibration
 from minimax_cal.instruments import (
     Instrument,
     Surface,
@@ -26,7 +32,7 @@ from minimax_cal.instruments import (
     write_relative,
 )
 from minimax_cal.instruments.sockets import reach
-from minimax_cal.robots.sampling import random_poses
+from minimax_cal.robots.joint_sampling import random_joint_values_above_floor
 
 # ---- instrument data -----------------------------------------------------------------------------
 
@@ -65,9 +71,9 @@ def test_what_is_written_is_read_back(kind, tmp_path, rng):
     assert found.at.line.tolist() == list(range(2, 14))
     # nine decimals of radians and millimetres
     assert_allclose(found.at.q, data.at.q, rtol=0, atol=1e-9)
-    told = data.columns()
-    assert list(found.columns()) == list(told) != []
-    for name, column in found.columns().items():
+    told = data.file_columns()
+    assert list(found.file_columns()) == list(told) != []
+    for name, column in found.file_columns().items():
         if column.dtype.kind == "U":
             assert column.tolist() == told[name].tolist()
         else:
@@ -240,14 +246,22 @@ FACES = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1]], dtyp
 Places = Callable[[int, np.random.Generator], tuple[Array, Array]]  # where, and the normals there
 
 
-def touched(arm: Arm, rng: np.random.Generator, places: Places, count: int, noise: float) -> Array:
+def touched(
+    arm: ImperfectArm, rng: np.random.Generator, places: Places, count: int, noise: float
+) -> Array:
     """Joints (count, n) at which the true arm's ball is at places of a surface."""
     q = np.zeros((0, arm.robot.joints))
     while len(q) < count:
         goal, normal = places(4 * count, rng)
         goal = goal + noise * rng.normal(size=(len(goal), 1)) * normal
-        found, gap = reach(arm.real, SPOT, goal, random_poses(arm.robot, len(goal), rng), 30)
-        q = np.concatenate([q, found[(gap < 1e-9) & inside(arm.robot, found)]])[:count]
+        found, gap = reach(
+            arm.real,
+            RELATIVE_TARGET_POSITION,
+            goal,
+            random_joint_values_above_floor(arm.robot, len(goal), rng),
+            30,
+        )
+        q = np.concatenate([q, found[(gap < 1e-9) & is_within_limits(arm.robot, found)]])[:count]
     return q
 
 
@@ -274,7 +288,7 @@ def dome(centre: Array) -> Places:
 
 
 def contacts_with(
-    arm: Arm, rng: np.random.Generator, shapes: list[tuple[Surface, Places]], noise: float,
+    arm: ImperfectArm, rng: np.random.Generator, shapes: list[tuple[Surface, Places]], noise: float,
     ball: float = np.nan,
 ) -> Instrument:  # fmt: skip
     q = [touched(arm, rng, places, 30, noise) for _, places in shapes]
@@ -282,7 +296,7 @@ def contacts_with(
     return contacts(np.concatenate(q), labels, [surface for surface, _ in shapes], ball)
 
 
-def planes(arm: Arm, seed: int, noise: float) -> Instrument:
+def planes(arm: ImperfectArm, seed: int, noise: float) -> Instrument:
     size, rng = arm.robot.reach(), np.random.default_rng([seed, 3])
     specs = [([0, 0, 1], [0.45, 0, 0.1]), ([-1, 0.1, 0], [0.6, 0, 0.4]),
              ([0, 1, 0.2], [0.3, -0.4, 0.35]), ([0.5, 0.5, 0.7], [-0.1, 0.4, 0.3])]  # fmt: skip
@@ -290,7 +304,7 @@ def planes(arm: Arm, seed: int, noise: float) -> Instrument:
     return contacts_with(arm, rng, [(Surface(f"B{i}"), b) for i, b in enumerate(boards)], noise)
 
 
-def spheres(arm: Arm, seed: int, noise: float, *, known: bool = True) -> Instrument:
+def spheres(arm: ImperfectArm, seed: int, noise: float, *, known: bool = True) -> Instrument:
     size, rng = arm.robot.reach(), np.random.default_rng([seed, 4])
     centres = size * np.array([[0.45, 0.1, 0.25], [0.1, 0.5, 0.4], [-0.3, -0.4, 0.2]])
     radius, ball = (RADIUS, BALL) if known else (np.nan, np.nan)
@@ -298,7 +312,7 @@ def spheres(arm: Arm, seed: int, noise: float, *, known: bool = True) -> Instrum
     return contacts_with(arm, rng, shapes, noise, ball)
 
 
-def cube(arm: Arm, seed: int, noise: float) -> Instrument:
+def cube(arm: ImperfectArm, seed: int, noise: float) -> Instrument:
     rng, turn = np.random.default_rng([seed, 5]), Rotation.from_rotvec([0.2, -0.1, 0.5]).as_matrix()
     origin = arm.robot.reach() * np.array([0.45, 0.1, 0.3])
     shapes = [
@@ -312,17 +326,19 @@ MAKERS = {"planes": planes, "spheres": spheres, "cube": cube}
 
 
 @cache
-def fitted(kind: str, name: str, seed: int, noise: float) -> tuple[Arm, RelativeCalibration]:
-    arm = Arm.of(name, seed, 0.0)
+def fitted(
+    kind: str, name: str, seed: int, noise: float
+) -> tuple[ImperfectArm, RelativeCalibration]:
+    arm = ImperfectArm.draw(name, seed, 0.0)
     return arm, relative(arm.robot, MAKERS[kind](arm, seed, noise))
 
 
-def off(arm: Arm, fit: RelativeCalibration, *, scaled: bool) -> float:
+def off(arm: ImperfectArm, fit: RelativeCalibration, *, scaled: bool) -> float:
     """RMS error of fresh positions after the best rigid motion, or similarity [mm]."""
     spot = 1e-3 * np.array(fit.instrument["target_mm"])
-    q = random_poses(arm.robot, 300, np.random.default_rng(8))
+    q = random_joint_values_above_floor(arm.robot, 300, np.random.default_rng(8))
     return float(
-        1e3 * np.sqrt(np.mean(position_errors(arm, fit.robot, spot, q, scaled=scaled) ** 2))
+        1e3 * np.sqrt(np.mean(position_errors(arm, fit.robot, spot, q, with_scale=scaled) ** 2))
     )
 
 
@@ -350,8 +366,8 @@ def test_errors_are_what_the_sigmas_say(kind):
     ratios = []
     for name in ("irb2600", "ur10"):
         for seed in range(4):
-            arm, fit = fitted(kind, name, seed, NOISE)
-            assert fit.accuracy["holdout"].rms_mm < 3e3 * NOISE
+            arm, fit = fitted(kind, name, seed, RELATIVE_LENGTH_NOISE)
+            assert fit.accuracy["holdout"].rms_mm < 3e3 * RELATIVE_LENGTH_NOISE
             assert np.isnan(fit.position_sigma) == (kind == "planes")  # which know no length
             ratios.append(off(arm, fit, scaled=False) / (1e3 * fit.position_sigma))
     if kind == "planes":
@@ -361,7 +377,7 @@ def test_errors_are_what_the_sigmas_say(kind):
 
 
 def test_what_was_touched_is_where_it_is_said_to_be():
-    _, fit = fitted("cube", "irb2600", 1, NOISE)
+    _, fit = fitted("cube", "irb2600", 1, RELATIVE_LENGTH_NOISE)
     found = fit.instrument["surfaces"]
     normals = np.array([found[f"F{i}"]["normal"] for i in range(5)])
     assert_allclose(normals @ normals.T, FACES @ FACES.T, atol=1e-9)  # a cube
@@ -374,8 +390,8 @@ def test_what_was_touched_is_where_it_is_said_to_be():
 
 
 def test_unknown_radii_of_ball_and_spheres_are_said_to_be_one():
-    arm = Arm.of("ur10", 2, 0.0)
-    fit = relative(arm.robot, spheres(arm, 2, NOISE, known=False))
+    arm = ImperfectArm.draw("ur10", 2, 0.0)
+    fit = relative(arm.robot, spheres(arm, 2, RELATIVE_LENGTH_NOISE, known=False))
     told = {p.name: p for p in fit.parameters}
     assert not told["ball_radius"].identifiable
     assert "all surfaces moved together" in told["ball_radius"].reason
@@ -384,16 +400,18 @@ def test_unknown_radii_of_ball_and_spheres_are_said_to_be_one():
 
 
 def test_contacts_join_a_tracker():
-    arm, rng = Arm.of("irb2600", 0, 0.0), np.random.default_rng(1)
-    q = random_poses(arm.robot, 20, rng)
-    seen = mc.measurements(q, arm.place(q) + NOISE * rng.normal(size=(20, 3)))
-    fit = relative(arm.robot, [planes(arm, 0, NOISE), seen])
+    arm, rng = ImperfectArm.draw("irb2600", 0, 0.0), np.random.default_rng(1)
+    q = random_joint_values_above_floor(arm.robot, 20, rng)
+    seen = mc.measurements(
+        q, arm.target_positions(q) + RELATIVE_LENGTH_NOISE * rng.normal(size=(20, 3))
+    )
+    fit = relative(arm.robot, [planes(arm, 0, RELATIVE_LENGTH_NOISE), seen])
     assert [one.name for one in fit.instruments] == ["contacts", "points"]
     assert not any("scale" in notice for notice in fit.notices)
     assert fit.instruments[1].directions_alone == 1  # the scale
     spot = 1e-3 * np.array(fit.instruments[0].instrument["target_mm"])
-    checks = random_poses(arm.robot, 300, np.random.default_rng(8))
-    error = position_errors(arm, fit.robot, spot, checks, scaled=False)
+    checks = random_joint_values_above_floor(arm.robot, 300, np.random.default_rng(8))
+    error = position_errors(arm, fit.robot, spot, checks, with_scale=False)
     assert np.sqrt(np.mean(error**2)) < 1.6 * fit.position_sigma < 40e-6
 
 
@@ -401,12 +419,12 @@ def test_contacts_join_a_tracker():
 
 
 def test_slips_are_named():
-    arm = Arm.of("irb2600", 1, 0.0)
-    data = planes(arm, 1, NOISE)
+    arm = ImperfectArm.draw("irb2600", 1, 0.0)
+    data = planes(arm, 1, RELATIVE_LENGTH_NOISE)
     turned = replace(data, at=replace(data.at, q=data.at.q * [1, 1, -1, 1, 1, 1]))
     with pytest.raises(mc.DataError, match="the sign of joint 3 looks reversed"):
         relative(arm.robot, turned)
-    balls = spheres(arm, 1, NOISE)
+    balls = spheres(arm, 1, RELATIVE_LENGTH_NOISE)
     small = tuple(replace(s, size=1e-3 * s.size) for s in balls.surfaces)
     with pytest.raises(mc.DataError, match=r"has a radius of .* mm, not 0.02 mm; check radius_mm"):
         relative(arm.robot, replace(balls, surfaces=small))
@@ -414,7 +432,7 @@ def test_slips_are_named():
 
 @pytest.mark.parametrize("kind", list(MAKERS))
 def test_contacts_that_are_written_are_read_back(kind, tmp_path):
-    data = MAKERS[kind](Arm.of("ur10", 0, 0.0), 0, NOISE)
+    data = MAKERS[kind](ImperfectArm.draw("ur10", 0, 0.0), 0, RELATIVE_LENGTH_NOISE)
     path = tmp_path / "contacts.csv"
     write_relative(path, data)
     found = read_relative(path)

@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
 from experiments.agreement import SimulatedArm
-from minimax_cal.fitting.several.kinds import relative
+from minimax_cal.fitting.multi_instrument.relative_calibration import relative
 from minimax_cal.instruments import flange_poses
-from minimax_cal.instruments.poses import rotations_as
+from minimax_cal.instruments.whole_poses import propose_other_rotation_conventions
 
 REPORTS = SHARED / "reports"
 HEAD = [f"q{i}_rad" for i in range(1, 7)] + [f"flange_{axis}_mm" for axis in "xyz"]
@@ -28,7 +28,7 @@ def arm():
 
 @pytest.fixture(scope="module")
 def poses(arm):
-    return arm.measure("poses", 50, 2e-5)
+    return arm.simulate_measurement("poses", 50, 2e-5)
 
 
 def written(path, data, names, columns):
@@ -61,11 +61,11 @@ def test_euler_angles_so_small_that_an_arm_nearly_fits_them_contradict_it(order,
     arm = SimulatedArm(mc.load_robot("irb2600"), np.random.default_rng(1), "leaning", 2e-4)
     rng, middle = arm.rng, np.array([0.1, 0.2, -0.1, 0.3, 0.5, 0.2])
     q = middle + 0.1 * rng.uniform(-1.0, 1.0, (60, 6))
-    seen = arm.pose(q)
+    seen = arm.flange_poses(q)
     seen[:, :3, 3] += 3e-5 * rng.normal(size=(60, 3))
     noise = Rotation.from_rotvec(3e-4 * rng.normal(size=(60, 3)))
     tool = Rotation.from_rotvec([0.1, -0.05, 0.08])
-    base = Rotation.from_matrix(arm.pose(middle[None])[0, :3, :3]).inv()
+    base = Rotation.from_matrix(arm.flange_poses(middle[None])[0, :3, :3]).inv()
     turn = noise * base * Rotation.from_matrix(seen[:, :3, :3]) * tool
     seen[:, :3, 3] = base.apply(seen[:, :3, 3])
     columns = turn.as_euler(order) if order else turn.as_rotvec()
@@ -107,8 +107,8 @@ ROWS = {  # which rows of joints and of what was measured stand beside each othe
 @pytest.mark.parametrize("words", ROWS)
 def test_rows_beside_other_joints_are_named_of_any_instrument(kind, words, arm):
     joints, own = ROWS[words]
-    data = arm.measure(kind, 50, 2e-5)
-    wrong = data.take(np.arange(50)[own])
+    data = arm.simulate_measurement(kind, 50, 2e-5)
+    wrong = data.take_rows(np.arange(50)[own])
     wrong = replace(wrong, at=replace(wrong.at, q=data.at.q[joints]))
     with pytest.raises(mc.DataError, match=f"{words}.*correct the file") as caught:
         relative("irb2600", wrong)
@@ -116,7 +116,7 @@ def test_rows_beside_other_joints_are_named_of_any_instrument(kind, words, arm):
 
 
 def test_joint_columns_exchanged_are_named_of_wires(arm):
-    data = arm.measure("wires", 60, 2e-5)
+    data = arm.simulate_measurement("wires", 60, 2e-5)
     wrong = replace(data, at=replace(data.at, q=data.at.q[:, [0, 2, 1, 3, 4, 5]]))
     with pytest.raises(mc.DataError, match="columns of joints 2 and 3 look swapped"):
         relative("irb2600", wrong)
@@ -133,7 +133,7 @@ def test_a_quaternion_in_another_order_is_named(poses, tmp_path, refuses):
 
 def test_each_reading_of_rotations_is_that_of_scipy(rng):
     angles = rng.uniform(-1.0, 1.0, (7, 3))
-    found = dict(rotations_as(angles))
+    found = dict(propose_other_rotation_conventions(angles))
     assert len(found) == 3 * 25 + 2
     (zyx,) = [t for text, t in found.items()
               if "moving axes, Rz Ry Rx" in text and "angles about" in text]  # fmt: skip
@@ -156,7 +156,7 @@ def test_rotations_that_no_convention_explains_fail(arm, poses):
     [(1.0 / 25.4, "inches given as millimetres"), (1e-3, "metres given as millimetres")],
 )
 def test_lengths_in_another_unit_are_named(arm, factor, words, tmp_path, refuses):
-    data = arm.measure("wires", 60, 2e-5)
+    data = arm.simulate_measurement("wires", 60, 2e-5)
     names = [f"q{i}_rad" for i in range(1, 7)] + [f"{wire}_mm" for wire in data.wires]
 
     def put(name, scale):
@@ -170,7 +170,7 @@ def test_lengths_in_another_unit_are_named(arm, factor, words, tmp_path, refuses
 
 @pytest.mark.parametrize("kind", ["tracker", "wires", "poses"])
 def test_joints_that_never_move_are_said_first(arm, kind):
-    data = arm.measure(kind, 40, 2e-5)
+    data = arm.simulate_measurement(kind, 40, 2e-5)
     q = data.at.q[0] + 1e-4 * np.random.default_rng(0).normal(size=data.at.q.shape)
     still = replace(data.at, q=q)
     given = still if kind == "tracker" else replace(data, at=still)

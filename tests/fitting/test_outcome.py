@@ -10,18 +10,22 @@ from conftest import run
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.fitting.accuracy import accuracy
-from minimax_cal.fitting.checks import LARGE_LENGTH, too_changed
-from minimax_cal.fitting.improvement import compare_arms, improvement
-from minimax_cal.fitting.same_arm import FRACTION, check_arm, least_noise
-from minimax_cal.fitting.suspects import Suspect
+from minimax_cal.fitting.accuracy import summarise_point_errors
+from minimax_cal.fitting.arm_comparison import compare_paired_errors, compare_with_nominal
+from minimax_cal.fitting.arm_identity import (
+    MAX_NOISE_TO_ERROR_RATIO,
+    check_same_arm,
+    smallest_possible_noise,
+)
+from minimax_cal.fitting.data_slips import MAX_LENGTH_CHANGE_OF_REACH, describe_other_arm
+from minimax_cal.fitting.outliers import Outlier
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
-from minimax_cal.modelling.model import model_of
+from minimax_cal.modelling.global_start import fit_base_and_targets
+from minimax_cal.modelling.point_model import build_point_model
 from minimax_cal.modelling.simulate import Truth, gravity, simulate
-from minimax_cal.modelling.start import fit_base
+from minimax_cal.robots.joint_sampling import random_joint_values_above_floor
 from minimax_cal.robots.robot import robot_from_dict
-from minimax_cal.robots.sampling import random_poses
 
 # ---- outcome -------------------------------------------------------------------------------------
 
@@ -78,9 +82,9 @@ def test_large_changes_are_those_of_identified_links(robot):
     def said(joint: int, column: int, by: float, active: np.ndarray = known) -> str:
         mdh = robot.mdh.copy()
         mdh[joint, column] += by
-        return too_changed(robot, mdh, active)
+        return describe_other_arm(robot, mdh, active)
 
-    limits = [LARGE_LENGTH * reach] * 2 + list(np.radians([30.0, 5.0, 5.0]))
+    limits = [MAX_LENGTH_CHANGE_OF_REACH * reach] * 2 + list(np.radians([30.0, 5.0, 5.0]))
     for column, most in enumerate(limits):
         assert not said(2, column, 0.99 * most)
         assert f"{('a', 'd', 'theta', 'alpha', 'beta')[column]}3 by" in said(2, column, 1.01 * most)
@@ -161,9 +165,9 @@ def test_the_limit_is_a_twentieth_of_what_is_declared(robot):
     assert mc.calibrate(robot, data, "sum").status == "converged"
     fit = mc.calibrate(robot, data, "sum", instrument="100um")
     assert fit.status == "failed"
-    noise, _ = least_noise(fit.data, np.nan)
+    noise, _ = smallest_possible_noise(fit.data, np.nan)
     assert_allclose(noise, np.sqrt(3.0) * 100e-6 / 1.959964, rtol=1e-6)
-    assert np.sqrt(3.0) * 2e-6 < noise / FRACTION
+    assert np.sqrt(3.0) * 2e-6 < noise / MAX_NOISE_TO_ERROR_RATIO
     assert mc.calibrate(robot, data, "sum", instrument="10um").status == "converged"
 
 
@@ -244,8 +248,11 @@ def test_before_and_after_are_of_the_same_poses_by_the_same_rule(robot):
     drawn = fit.error_drawn_crossed
     assert drawn.shape == fit.error_crossed.shape
     assert_allclose(drawn[fit.held], fit.error_nominal[fit.held], rtol=0, atol=1e-9)
-    assert accuracy(drawn[~fit.held]).rms_mm > accuracy(fit.error_nominal[~fit.held]).rms_mm
-    assert_allclose(fit.within.before.rms_mm, accuracy(drawn).rms_mm, rtol=1e-12)
+    assert (
+        summarise_point_errors(drawn[~fit.held]).rms_mm
+        > summarise_point_errors(fit.error_nominal[~fit.held]).rms_mm
+    )
+    assert_allclose(fit.within.before.rms_mm, summarise_point_errors(drawn).rms_mm, rtol=1e-12)
     assert fit.within.before.counts == fit.within.after.counts
     told_first = fit.accuracy_table().rows[0]
     assert told_first[0] == "cross-validated, nominal"
@@ -257,25 +264,27 @@ def test_before_and_after_are_of_the_same_poses_by_the_same_rule(robot):
     fold = part[np.searchsorted(names, fit.group)]
     train = np.flatnonzero(~fit.held)
     rest = data.take(train[fold != fold[0]])
-    state = fit_base(model_of(robot, rest), robot.mdh).state
-    own = Cell.of(robot, state, data.target_names).error(data.take(np.array([row])))
-    assert_allclose(accuracy(drawn[[row]]).rms_mm, accuracy(own).rms_mm, rtol=0.02)
+    state = fit_base_and_targets(build_point_model(robot, rest), robot.mdh).state
+    own = Cell.from_parameters(robot, state, data.target_names).error(data.take(np.array([row])))
+    assert_allclose(
+        summarise_point_errors(drawn[[row]]).rms_mm, summarise_point_errors(own).rms_mm, rtol=0.02
+    )
 
 
 def test_the_comparison_is_paired(rng):
     drawn = rng.normal(size=(50, 2, 3))
     group = np.arange(50)
-    same = compare_arms(drawn, drawn, group)
+    same = compare_paired_errors(drawn, drawn, group)
     assert same.gain == same.error == 0.0
     assert not same.is_better
-    found = compare_arms(drawn, 0.9 * drawn, group)
+    found = compare_paired_errors(drawn, 0.9 * drawn, group)
     square = (1e6 * drawn**2).sum(axis=(1, 2)) * (1.0 - 0.81) / 2.0
     assert_allclose(found.gain, square.mean(), rtol=1e-12)
     assert_allclose(found.error, square.std(ddof=1) / np.sqrt(50), rtol=1e-12)
     twice = np.concatenate([drawn, drawn])  # visits again count once
-    again = compare_arms(twice, 0.9 * twice, np.tile(group, 2))
+    again = compare_paired_errors(twice, 0.9 * twice, np.tile(group, 2))
     assert_allclose([again.gain, again.error], [found.gain, found.error], rtol=1e-12)
-    assert compare_arms(drawn[:1], drawn[:1], group[:1]).is_better  # nobody can say
+    assert compare_paired_errors(drawn[:1], drawn[:1], group[:1]).is_better  # nobody can say
 
 
 def test_a_held_out_outlier_does_not_hide_a_better_arm(robot):
@@ -305,9 +314,11 @@ def test_a_point_that_only_the_calibrated_arm_misses_counts(robot):
     drawn, after = fit.error_nominal.copy(), fit.error.copy()
     after[row, 0] += 0.1
     one = mc.calibrate(robot, fit.data, "sum").suspects
-    off = Suspect(int(fit.data.line[row]), "smr1", 0.1, 99.0, 0.0, False, True)
+    off = Outlier(int(fit.data.line[row]), "smr1", 0.1, 99.0, 0.0, False, True)
     hidden = np.where(fit.held[:, None, None], 1.0, np.nan)
-    found = improvement(drawn * hidden, after * hidden, np.arange(120), fit.data, (*one, off))
+    found = compare_with_nominal(
+        drawn * hidden, after * hidden, np.arange(120), fit.data, (*one, off)
+    )
     assert not found.is_better
     assert not found.wrong
 
@@ -371,7 +382,7 @@ def sound_arm(seed: int) -> tuple[str, float, str]:
     made = simulate(name, poses, targets, seed, truth)
     fit = mc.calibrate(name, as_measured(made.data), ("minimax", "sum")[seed % 2])
     robot = mc.load_robot(name)
-    q = random_poses(robot, 300, np.random.default_rng(seed + 10**6), np.pi)
+    q = random_joint_values_above_floor(robot, 300, np.random.default_rng(seed + 10**6), np.pi)
     y = made.cell.predict(q + compliance * gravity(made.cell.robot, q))
     before, after = (np.linalg.norm(cell.predict(q) - y) for cell in (fit.nominal, fit.cell))
     case = f"{seed}: {name}, {poses} poses, {targets} targets, size {size:.2g}"
@@ -402,7 +413,7 @@ def turned(data: mc.Measurements, joint: int, angle: float) -> mc.Measurements:
 
 def test_another_arm_or_unit_is_refused_before_anything_is_judged(fit, noisy, tmp_path):
     few = noisy.data.take(np.arange(12))
-    check_arm(fit.robot, few)
+    check_same_arm(fit.robot, few)
     with pytest.raises(mc.DataError, match="millimetres given as metres"):
         mc.check(fit, few.with_y(1e3 * few.y), "rms 0.5")
     with pytest.raises(mc.DataError, match=r"misses ABB IRB 2600.* by \d+ mm wherever base"):
@@ -417,14 +428,14 @@ def test_another_arm_or_unit_is_refused_before_anything_is_judged(fit, noisy, tm
 @pytest.mark.parametrize("angle", [5e-3, 0.1, 0.5])
 def test_a_zero_may_have_moved_far(fit, noisy, angle):
     few = turned(noisy.data.take(np.arange(20)), 1, angle)
-    check_arm(fit.robot, few)
+    check_same_arm(fit.robot, few)
     if angle < 0.05:
         found = mc.check(fit, few, "rms 0.5")
         assert {moved.joint for moved in found.moved} == {"J2"}
 
 
 def test_too_few_poses_say_nothing_of_the_arm(fit):
-    check_arm(fit.robot, mc.simulate("ur10", 2, 3, seed=5).data)
+    check_same_arm(fit.robot, mc.simulate("ur10", 2, 3, seed=5).data)
 
 
 def test_calibrations_of_two_arms_are_not_compared(fit, robot):

@@ -12,27 +12,27 @@ from numpy.testing import assert_allclose
 
 import minimax_cal as mc
 from experiments.pixel_cells import (
-    NOISE,
-    Cell,
-    View,
-    arm_error,
-    board_points,
-    camera_text,
-    data_of,
-    make_cell,
-    write_cell,
+    PIXEL_NOISE,
+    PixelCell,
+    SimulatedCamera,
+    board_corner_points,
+    build_pixel_data,
+    format_camera_yaml,
+    rms_arm_error_mm,
+    simulate_pixel_cell,
+    write_cell_files,
 )
-from minimax_cal.fitting.pixels.beside import as_instrument, detected
-from minimax_cal.fitting.pixels.calibrate import fitted
+from minimax_cal.core.arrays import Array
+from minimax_cal.fitting.pixels.calibrate import calibrate_pixel_data
+from minimax_cal.fitting.pixels.image_instrument import as_image_instrument, read_detections
 from minimax_cal.fitting.pixels.options import PixelOptions
-from minimax_cal.ground.arrays import Array
-from minimax_cal.instruments.camera import read_camera
-from minimax_cal.instruments.pixels import PixelData, read_pixels
+from minimax_cal.instruments.camera_model import read_camera_file
+from minimax_cal.instruments.pixel_data import PixelData, read_pixel_data
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.robots import kinematics
-from minimax_cal.robots.gravity import masses_of, torques
-from minimax_cal.robots.kinematics import rotation
-from minimax_cal.robots.sampling import random_joints
+from minimax_cal.robots.gravity_torques import joint_gravity_torques, link_masses_and_centres
+from minimax_cal.robots.joint_sampling import random_joint_values
+from minimax_cal.robots.kinematics import rotation_from_vector
 from minimax_cal.solvers.status import Status
 
 # ---- pixels beside -------------------------------------------------------------------------------
@@ -41,25 +41,29 @@ from minimax_cal.solvers.status import Status
 SPOTS = np.array([[0.1, 0.0, 0.03], [-0.05, 0.08, 0.03], [-0.05, -0.08, 0.05]])  # [m]
 
 
-def cell_of(seed: int, **more: object) -> Cell:
+def cell_of(seed: int, **more: object) -> PixelCell:
     """A small cell, the camera on the flange or the ground by turns."""
-    given = {"points": board_points((6, 5), 0.04), "poses": 20, "on_flange": bool(seed % 2)}
-    return make_cell(np.random.default_rng(seed), **given | more)
+    given = {
+        "target_points": board_corner_points((6, 5), 0.04),
+        "pose_count": 20,
+        "on_flange": bool(seed % 2),
+    }
+    return simulate_pixel_cell(np.random.default_rng(seed), **given | more)
 
 
 def tracked(
-    cell: Cell, seed: int, poses: int, noise: float, wrist: Array | None = None
+    cell: PixelCell, seed: int, poses: int, noise: float, wrist: Array | None = None
 ) -> Measurements:
     """What a tracker measures of the same arm at other poses.
 
     noise: of a coordinate [m].  wrist: (3,) joints 4 to 6, where they stay [rad].
     """
     rng = np.random.default_rng([seed, 9])
-    q = random_joints(cell.true, (poses,), rng)
+    q = random_joint_values(cell.true, (poses,), rng)
     q[:, 3:] = q[:, 3:] if wrist is None else wrist
     pose = cell.true.pose(cell.law(q))
     point = np.einsum("mij,kj->mki", pose[:, :3, :3], SPOTS) + pose[:, None, :3, 3]
-    point = point @ rotation(np.array([0.1, 0.0, 0.7])).T + [2.0, 1.0, 0.3]
+    point = point @ rotation_from_vector(np.array([0.1, 0.0, 0.7])).T + [2.0, 1.0, 0.3]
     return mc.measurements(q, point + noise * rng.normal(size=point.shape))
 
 
@@ -69,22 +73,22 @@ def test_both_are_never_worse_than_either(poses, noise):
     errors = []
     for seed in range(4):
         cell = cell_of(seed)
-        data, images = tracked(cell, seed, poses, noise), data_of(cell)
-        both = mc.relative(cell.drawn, [data, as_instrument(images)], holdout=0.0)
+        data, images = tracked(cell, seed, poses, noise), build_pixel_data(cell)
+        both = mc.relative(cell.drawn, [data, as_image_instrument(images)], holdout=0.0)
         assert both.status is Status.CONVERGED
         alone = mc.calibrate(cell.drawn, data, "sum", holdout=0.0)
-        pixels = fitted(cell.drawn, images, PixelOptions(holdout=0.0))
+        pixels = calibrate_pixel_data(cell.drawn, images, PixelOptions(holdout=0.0))
         arms = (both.robot, alone.robot, pixels.calibrated or pixels.robot)
-        errors.append([arm_error(cell, arm) for arm in arms])
+        errors.append([rms_arm_error_mm(cell, arm) for arm in arms])
         tracker, camera = both.instruments
         assert_allclose(tracker.noise, noise, rtol=0.25)
         metre = np.median(both_depths(cell)) / 2500.0
-        assert_allclose(camera.noise, NOISE * metre, rtol=0.3)
+        assert_allclose(camera.noise, PIXEL_NOISE * metre, rtol=0.3)
     together, *either = np.sqrt(np.mean(np.square(errors), axis=0))
     assert together < 0.95 * min(either)
 
 
-def both_depths(cell: Cell) -> Array:
+def both_depths(cell: PixelCell) -> Array:
     """Depths of the board in the images [m]."""
     flange = cell.true.pose(cell.q)
     view = cell.views[0].pose
@@ -97,7 +101,7 @@ def test_what_only_the_camera_determines_is_said():
     """The tracker sees an arm whose wrist stays: joints 4 to 6 are told by the camera alone."""
     cell = cell_of(1)
     data = tracked(cell, 1, 30, 3e-5, wrist=np.array([0.3, -0.8, 0.5]))
-    both = mc.relative(cell.drawn, [as_instrument(data_of(cell)), data])
+    both = mc.relative(cell.drawn, [as_image_instrument(build_pixel_data(cell)), data])
     assert [one.kind for one in both.instruments] == ["points", "pixels"]
     tracker, camera = both.instruments
     assert not tracker.directions_alone
@@ -112,36 +116,36 @@ def test_what_only_the_camera_determines_is_said():
 
 def test_wrong_pixels_do_not_count():
     cell, rng = cell_of(2), np.random.default_rng(1)
-    data = data_of(cell)
-    wrong = rng.random(data.count) < 0.03
+    data = build_pixel_data(cell)
+    wrong = rng.random(data.pixel_count) < 0.03
     pixel = data.pixel + np.where(wrong[:, None], 5.0 + rng.exponential(30.0, data.pixel.shape), 0)
-    given = [tracked(cell, 2, 24, 3e-5), as_instrument(replace(data, pixel=pixel))]
+    given = [tracked(cell, 2, 24, 3e-5), as_image_instrument(replace(data, pixel=pixel))]
     both = mc.relative(cell.drawn, given)
-    assert arm_error(cell, both.robot) < 0.02
+    assert rms_arm_error_mm(cell, both.robot) < 0.02
     assert both.instruments[1].accuracy["train"].max_mm < 0.5
 
 
 def test_images_of_other_poses_are_named_and_judge_nothing():
     cell = cell_of(2)
-    data = data_of(cell)
+    data = build_pixel_data(cell)
     late = data.at.columns | {"split": np.array(["holdout"] * 4 + ["train"] * 16)}
     q = data.at.q.copy()
     q[[0, 9]] += 0.2  # one that is held out, and one that is not
     data = replace(data, at=replace(data.at, q=q, columns=late))
-    both = mc.relative(cell.drawn, [tracked(cell, 2, 24, 3e-5), as_instrument(data)])
+    both = mc.relative(cell.drawn, [tracked(cell, 2, 24, 3e-5), as_image_instrument(data)])
     named = "whole images are outliers, set aside: pose P9 of camera cam0"
     assert any(named in said for said in both.notices)
-    assert arm_error(cell, both.robot) < 0.02
-    alone = fitted(cell.drawn, data, PixelOptions())
+    assert rms_arm_error_mm(cell, both.robot) < 0.02
+    alone = calibrate_pixel_data(cell.drawn, data, PixelOptions())
     assert any("2 whole images" in said and "pose P0" in said for said in alone.notices)
-    assert alone.pixels["holdout"][0] < 3.0 * NOISE
+    assert alone.pixels["holdout"][0] < 3.0 * PIXEL_NOISE
     assert alone.with_them is not None
     assert alone.with_them.rms_mm > 5.0
 
 
 def test_the_worst_of_pixels_is_a_target_of_a_camera():
     cell = cell_of(2)
-    given = [tracked(cell, 2, 24, 3e-5), as_instrument(data_of(cell))]
+    given = [tracked(cell, 2, 24, 3e-5), as_image_instrument(build_pixel_data(cell))]
     both = mc.relative(cell.drawn, given, objective="minimax")
     assert both.worst is not None
     assert {"pixels c0", "pixels c29"} < {*both.worst.functions}
@@ -154,9 +158,9 @@ def test_the_worst_of_pixels_is_a_target_of_a_camera():
 @pytest.mark.parametrize("board", [True, False], ids=["board", "tags"])
 def test_lenses_that_are_held_stay(board):
     cell = cell_of(2)
-    data = data_of(cell, board=board)
-    data = data.some((data.pose > 0) | (data.target < 5))  # one image shows little
-    given = [tracked(cell, 2, 24, 3e-5), as_instrument(data)]
+    data = build_pixel_data(cell, with_board=board)
+    data = data.take_pixels((data.pose > 0) | (data.target < 5))  # one image shows little
+    given = [tracked(cell, 2, 24, 3e-5), as_image_instrument(data)]
     both = mc.relative(cell.drawn, given, fix_camera=True)
     lens = [p for p in both.parameters if p.name.endswith(("fx", "k1"))]
     assert len(lens) == 2
@@ -173,47 +177,58 @@ SPRING, SPRUNG = 3e-5, "joint_compliance:J2"  # [rad/(N m)]
 def spring(q: Array) -> Array:
     """Where the joints truly are of an arm whose second one winds up under gravity."""
     robot = mc.load_robot("ur5")
-    links = kinematics.chain(robot.mdh, robot.turned(q), robot.prismatic)
-    return np.asarray(q + SPRING * np.eye(6)[1] * torques(links, *masses_of(robot), robot.up).T)
+    links = kinematics.compute_link_frames(robot.mdh, robot.chain_joint_values(q), robot.prismatic)
+    return np.asarray(
+        q
+        + SPRING
+        * np.eye(6)[1]
+        * joint_gravity_torques(links, *link_masses_and_centres(robot), robot.up).T
+    )
 
 
 @pytest.mark.parametrize("on_flange", [True, False], ids=["eye in hand", "eye to hand, a tracker"])
 def test_an_effect_of_the_arm_is_found_by_cameras(on_flange):
     """Its sigmas hold the spring, whatever masses it bears, and the claim the arm's error."""
-    points = board_points((4, 3), 0.08)
-    cell = cell_of(1, on_flange=on_flange, law=spring, poses=40, points=points)
-    images = as_instrument(data_of(cell))
+    points = board_corner_points((4, 3), 0.08)
+    cell = cell_of(
+        1, on_flange=on_flange, true_joint_law=spring, pose_count=40, target_points=points
+    )
+    images = as_image_instrument(build_pixel_data(cell))
     gap = mc.diagnose_relative(
         cell.drawn, images if on_flange else [tracked(cell, 1, 30, 3e-5), images]
     )
     assert gap.verdict == "named"
     assert [(one.term.label, one.established) for one in gap.effects] == [(SPRUNG, True)]
     fit = gap.calibration
-    found = [p for p in fit.parameters if p.of_effect]
+    found = [p for p in fit.parameters if p.is_of_effect]
     assert max(abs(p.value - SPRING) / p.sigma for p in found) < 3.5
     assert fit.accuracy["holdout"].rms_mm < 0.1 * gap.steps[1].holdout.rms_mm
     assert not fit.positions_open
     assert fit.cell is not None
     straight = replace(cell, law=np.asarray)  # its joints where they are told to be
-    assert arm_error(straight, fit.cell.robot) < 2.5e3 * fit.position_sigma
+    assert rms_arm_error_mm(straight, fit.cell.robot) < 2.5e3 * fit.position_sigma
     again = mc.relative(cell.drawn, images, effects=SPRUNG)
     assert again.instruments[0].kind == "pixels"
-    assert {p.name.partition(".")[0] for p in again.parameters if p.of_effect} == {SPRUNG}
+    assert {p.name.partition(".")[0] for p in again.parameters if p.is_of_effect} == {SPRUNG}
 
 
 def test_from_files_to_a_report(tmp_path, answered, refuses):
     cell = cell_of(1)
-    files, points, result = write_cell(cell, tmp_path), tmp_path / "t.csv", tmp_path / "r.json"
+    files, points, result = (
+        write_cell_files(cell, tmp_path),
+        tmp_path / "t.csv",
+        tmp_path / "r.json",
+    )
     mc.write_measurements(points, tracked(cell, 1, 24, 3e-5))
     content = answered("relative ur5", points, *files, "-o", result)
     assert [one["name"] for one in content["instruments"]] == ["t", "detections"]
     assert [one["kind"] for one in content["instruments"]] == ["points", "pixels"]
     assert {"alone", "directions_alone", "file", "noise", "unit"} <= set(content["instruments"][1])
-    assert arm_error(cell, mc.load_robot(result)) < 0.03
+    assert rms_arm_error_mm(cell, mc.load_robot(result)) < 0.03
     assert run("report", result, "-o", tmp_path / "report.html") == 0
     assert repr(mc.load_fit(result)) == "<RelativeCalibration of Universal Robots UR5: converged>"
     cameras = {"cam0": tmp_path / "cam0.yaml"}
-    images = detected(
+    images = read_detections(
         tmp_path / "detections.csv", tmp_path / "joints.csv", cameras, tmp_path / "board.csv"
     )
     again = mc.relative("ur5", [points, images], camera_on="flange")
@@ -225,7 +240,7 @@ def test_from_files_to_a_report(tmp_path, answered, refuses):
 
 
 K, D = (2500.0, 2510.0, 1223.5, 1023.5), (-0.12, 0.08, 2e-4, -3e-4, 1e-05)
-OPENCV = camera_text(View(np.eye(4), K, D))
+OPENCV = format_camera_yaml(SimulatedCamera(np.eye(4), K, D))
 MATRIX = "[2500.0, 0.0, 1223.5, 0.0, 2510.0, 1023.5, 0.0, 0.0, 1.0]"
 ROS = f"""image_width: 2448
 image_height: 2048
@@ -275,8 +290,8 @@ def folder_of(
 
 
 def read(path: Path, names: tuple[str, ...] = ("left",), board: bool = True) -> PixelData:
-    cameras = [read_camera(name, path / "left.yaml") for name in names]
-    return read_pixels(
+    cameras = [read_camera_file(name, path / "left.yaml") for name in names]
+    return read_pixel_data(
         path / "detections.csv", path / "joints.csv", cameras, path / "board.csv" if board else None
     )
 
@@ -301,7 +316,7 @@ def test_files_of_a_cell_in_german(tmp_path):
 )
 def test_cameras_of_opencv_and_ros_are_one(text, count, size, tmp_path):
     (tmp_path / "camera.yaml").write_text(text)
-    camera = read_camera("left", tmp_path / "camera.yaml")
+    camera = read_camera_file("left", tmp_path / "camera.yaml")
     known = 4 + min(count, len(D))
     assert camera.intrinsic.tolist() == [*K, *D, *np.zeros(7)][:known] + [0.0] * (16 - known)
     assert camera.size == size
@@ -329,7 +344,7 @@ def test_cameras_of_opencv_and_ros_are_one(text, count, size, tmp_path):
 def test_a_file_that_is_no_camera_is_refused(text, said, tmp_path):
     (tmp_path / "camera.yaml").write_text(text)
     with pytest.raises(mc.DataError, match=said) as error:
-        read_camera("left", tmp_path / "camera.yaml")
+        read_camera_file("left", tmp_path / "camera.yaml")
     assert "\n" not in str(error.value)
 
 

@@ -12,13 +12,19 @@ from scipy import integrate, optimize, stats
 
 import minimax_cal as mc
 from minimax_cal import solvers
-from minimax_cal.fitting import robust
-from minimax_cal.fitting.minimax_problem import measured_distances, minimax_problem
-from minimax_cal.fitting.robust import LOSSES, Weighted, distances, moments, robust_fit
-from minimax_cal.fitting.suspects import unlikely
-from minimax_cal.ground.arrays import Array
-from minimax_cal.modelling.model import Prior
-from minimax_cal.modelling.parameters import State
+from minimax_cal.core.arrays import Array
+from minimax_cal.fitting import robust_fit
+from minimax_cal.fitting.minimax_problem import build_minimax_problem, measured_distances
+from minimax_cal.fitting.outliers import reject_by_false_discovery_rate
+from minimax_cal.fitting.robust_fit import (
+    LOSSES,
+    WeightedFit,
+    fit_robust_loss,
+    loss_moments,
+    weighted_point_distances,
+)
+from minimax_cal.modelling.parameters import ParameterValues
+from minimax_cal.modelling.point_model import GaussianPrior
 from minimax_cal.modelling.simulate import Simulation, Truth, simulate
 from minimax_cal.solvers.minimax import Sqp
 from minimax_cal.solvers.status import Status
@@ -79,21 +85,21 @@ def small(robot: mc.Robot) -> Case:
     """Ten parameters of an arm that is otherwise known, one target, a tight prior on a2."""
     case = shifted(robot, 0.1, 2e-4, poses=30, targets=1, seed=2)
     cell, names = case.made.cell, case.model.names
-    active = np.isin(names.all, FREE)
-    weight = np.zeros(names.count)
-    weight[names.index("a2")] = (NOISE / 1e-5) ** 2
-    model = case.model.only(active).with_prior(Prior(case.model.prior.mean, weight))
-    truth = cell.state
+    active = np.isin(names.all_names, FREE)
+    weight = np.zeros(names.parameter_count)
+    weight[names.index_of_name("a2")] = (NOISE / 1e-5) ** 2
+    model = case.model.with_active(active).with_prior(GaussianPrior(case.model.prior.mean, weight))
+    truth = cell.parameter_values
     model, found = FITTER(model, truth)
     return replace(case, model=model, found=found)
 
 
-def moved(case: Case, x: Array) -> State:
+def moved(case: Case, x: Array) -> ParameterValues:
     """The plain fit moved by steps of the free parameters [0.1 mm, 0.1 mrad].
 
     Nothing of the base is free: steps simply add up.
     """
-    step = np.zeros(case.model.names.count)
+    step = np.zeros(case.model.names.parameter_count)
     step[case.model.active] = 1e-4 * x
     return state_of(case.found).step(step)
 
@@ -101,17 +107,22 @@ def moved(case: Case, x: Array) -> State:
 def residuals(case: Case, x: Array, unit: float) -> Array:
     """Distances, and the prior's roots [unit]."""
     state = moved(case, x)
-    off = np.sqrt(case.model.prior.weight) * (case.model.values(state) - case.model.prior.mean)
-    return np.concatenate([distances(case.model, state)[case.model.seen], off]) / unit
+    off = np.sqrt(case.model.prior.weight) * (
+        case.model.parameter_vector(state) - case.model.prior.mean
+    )
+    return (
+        np.concatenate([weighted_point_distances(case.model, state)[case.model.measured_mask], off])
+        / unit
+    )
 
 
 def slopes(case: Case, x: Array, unit: float) -> Array:
     """Their derivatives (n, free)."""
     model, state = case.model, moved(case, x)
-    rows = model.jacobian(state)[..., model.active]
-    error = model.error(state)
+    rows = model.point_jacobian(state)[..., model.active]
+    error = model.point_errors(state)
     along = error / np.linalg.norm(error, axis=-1, keepdims=True)
-    far = -np.einsum("mkcp,mkc->kmp", rows, along)[model.seen]
+    far = -np.einsum("mkcp,mkc->kmp", rows, along)[model.measured_mask]
     prior = np.diag(np.sqrt(model.prior.weight))[:, model.active]
     return np.concatenate([far, prior]) * 1e-4 / unit
 
@@ -121,7 +132,7 @@ def test_nothing_near_is_better(small, name):
     """BFGS on the sum of rho and the prior comes from beside the answer back to it."""
     found = small.robust(name)
     unit = found.loss_scale * LOSSES[name].tuning
-    points = int(small.model.seen.sum())
+    points = int(small.model.measured_mask.sum())
 
     def objective(x: Array) -> float:
         parts = residuals(small, x, unit)
@@ -132,7 +143,9 @@ def test_nothing_near_is_better(small, name):
         psi = np.append(u[:points] * LOSSES[name].weight(u[:points]), u[points:])
         return slopes(small, x, unit).T @ psi
 
-    values = [small.model.values(state_of(one)) for one in (found.found, small.found)]
+    values = [
+        small.model.parameter_vector(state_of(one)) for one in (found.least_squares, small.found)
+    ]
     ours = (values[0] - values[1])[small.model.active] / 1e-4
     beside = ours + 0.05 * np.random.default_rng(0).normal(size=len(ours))
     other = optimize.minimize(
@@ -152,9 +165,9 @@ def test_nothing_near_is_better(small, name):
 def test_a_fifth_of_wrong_points_does_no_harm(robot, loss, trim, size):
     case = shifted(robot, 0.2, size)
     found = case.robust(loss, trim)
-    assert found.found.status[0] == "converged"
+    assert found.least_squares.status[0] == "converged"
     knowing = case.miss(case.without())
-    assert case.miss(state_of(found.found)) < 1.25 * knowing
+    assert case.miss(state_of(found.least_squares)) < 1.25 * knowing
     assert case.miss(state_of(case.found)) > 5.0 * knowing
     assert_allclose(found.scale, NOISE, rtol=0.15)
     assert (case.listed(found) >= case.bad).all()
@@ -167,7 +180,7 @@ def test_a_fifth_of_wrong_points_does_no_harm(robot, loss, trim, size):
 def test_without_noise_the_truth_is_found(robot, loss, trim, most):
     case = shifted(robot, 0.2, 1e-3, truth=EXACT)
     found = case.robust(loss, trim)
-    assert case.miss(state_of(found.found)) < most
+    assert case.miss(state_of(found.least_squares)) < most
     assert (case.listed(found) == case.bad).all()
 
 
@@ -175,8 +188,8 @@ def test_without_noise_the_truth_is_found(robot, loss, trim, most):
 def test_clean_points_are_fitted_as_by_least_squares(robot, loss):
     case = shifted(robot, 0.0, 0.0, poses=80)
     found = case.robust(loss)
-    off = np.linalg.norm(case.model.error(state_of(found.found))
-                         - case.model.error(state_of(case.found)), axis=-1)  # fmt: skip
+    off = np.linalg.norm(case.model.point_errors(state_of(found.least_squares))
+                         - case.model.point_errors(state_of(case.found)), axis=-1)  # fmt: skip
     assert np.sqrt(np.mean(off**2)) < 0.3 * NOISE
     assert_allclose(found.scale, NOISE, rtol=0.1)
     aside = case.robust(trim=0.1)
@@ -187,7 +200,7 @@ def test_one_target(robot):
     case = shifted(robot, 0.1, 1e-3, poses=60, targets=1)
     for found in (case.robust("tukey"), case.robust(trim=0.15)):
         assert (case.listed(found) == case.bad).all()
-        assert case.miss(state_of(found.found)) < 1.3 * case.miss(case.without())
+        assert case.miss(state_of(found.least_squares)) < 1.3 * case.miss(case.without())
         assert not any(one.together for one in found.suspects)
 
 
@@ -206,7 +219,7 @@ def test_missing_points(robot):
     lines = case.data.line[alone]
     assert not any(one.together for one in found.suspects if one.line in lines)
     aside = case.robust(trim=0.2)
-    assert_allclose(aside.model.counts, (~gone.T & ~case.bad).sum(axis=1))
+    assert_allclose(aside.model.pose_counts_by_target, (~gone.T & ~case.bad).sum(axis=1))
 
 
 def test_weights_of_the_instrument_stay(robot):
@@ -225,7 +238,7 @@ def test_weights_of_the_instrument_stay(robot):
     assert (told.listed(found) == told.bad).all()
     assert_allclose(found.model.weight, told.model.weight * found.weights)
     assert_allclose(found.scale, NOISE, rtol=0.1)  # of a point with the typical u95
-    assert told.miss(state_of(found.found)) < 1.3 * told.miss(told.without())
+    assert told.miss(state_of(found.least_squares)) < 1.3 * told.miss(told.without())
 
 
 def few_that_tell_the_wrist(
@@ -248,13 +261,15 @@ def few_that_tell_the_wrist(
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_bad_pose_that_draws_the_fit_to_itself(robot, seed):
     case = few_that_tell_the_wrist(robot, (-1.2,), 1, 2e-3, seed, 1)
-    plain = distances(case.model, state_of(case.found))[0]
+    plain = weighted_point_distances(case.model, state_of(case.found))[0]
     assert (plain > plain[0]).sum() > 40  # least squares misses most other points by more
     found = case.robust("tukey")
     assert (case.listed(found) == case.bad).all()
     assert found.weights[0, 0] == 0.0
-    assert distances(case.model, state_of(found.found))[0, 0] > 20.0 * plain[0]
-    assert case.miss(state_of(found.found)) < 0.3 * case.miss(state_of(case.found))
+    assert (
+        weighted_point_distances(case.model, state_of(found.least_squares))[0, 0] > 20.0 * plain[0]
+    )
+    assert case.miss(state_of(found.least_squares)) < 0.3 * case.miss(state_of(case.found))
 
 
 def test_parameters_that_only_suspects_tell_are_named(robot):
@@ -275,7 +290,7 @@ def test_at_most_the_share_is_set_aside(robot):
     case = shifted(robot, 0.1, 1e-3)
     for share in (0.02, 0.05, 0.1, 0.2, 0.4):
         found = case.robust(trim=share)
-        away = (found.weights == 0.0) & case.model.seen
+        away = (found.weights == 0.0) & case.model.measured_mask
         assert away.sum() == min(int(share * case.bad.size), case.bad.sum())
         assert (away <= case.bad).all()
         assert any("give a larger share" in note for note in found.notices) == (share < 0.1)
@@ -286,13 +301,15 @@ def test_what_is_set_aside_is_a_fixed_point(robot):
     """The final fit itself finds just these points to stand out, and comes out again the same."""
     case = shifted(robot, 0.1, 3e-4, seed=4)
     found = case.robust(trim=0.2)
-    last = Weighted(FITTER, found.plain, found.found, found.weights, np.ones(3, dtype=bool))
+    last = WeightedFit(
+        FITTER, found.unweighted_model, found.least_squares, found.weights, np.ones(3, dtype=bool)
+    )
     judged = last.scores()
-    far = unlikely(last.spread(judged).p_value(judged))
+    far = reject_by_false_discovery_rate(last.spread(judged).p_value(judged))
     assert (far == (found.weights == 0.0)).all()
     again = case.robust(trim=0.2)
     assert_allclose(again.weights, found.weights, rtol=0)
-    assert_allclose(state_of(again.found).mdh, state_of(found.found).mdh, rtol=0)
+    assert_allclose(state_of(again.least_squares).mdh, state_of(found.least_squares).mdh, rtol=0)
 
 
 @pytest.mark.parametrize("per", ["target", "point"])
@@ -303,11 +320,13 @@ def test_minimax_on_the_trimmed_model_is_that_without_the_points(robot, per):
     deleted = case_of(robot, case.made, case.data.with_y(y), case.bad.T)
     worst = []
     for model, state in (
-        (found.model, state_of(found.found)),
-        (deleted.model.only(found.model.active), state_of(deleted.found)),
+        (found.model, state_of(found.least_squares)),
+        (deleted.model.with_active(found.model.active), state_of(deleted.found)),
     ):
-        assert_allclose(model.counts, (found.weights > 0.0).sum(axis=1))
-        problem = minimax_problem(model, state, measured_distances(case.data.with_y(y)), "off", per)
+        assert_allclose(model.pose_counts_by_target, (found.weights > 0.0).sum(axis=1))
+        problem = build_minimax_problem(
+            model, state, measured_distances(case.data.with_y(y)), "off", per
+        )
         best = solvers.minimax.solve(problem, state, partial(solve_qp, name="daqp"), Sqp())
         assert best.status == "converged"
         worst.append(best.f.max() * problem.size)
@@ -320,9 +339,11 @@ def test_minimax_on_the_trimmed_model_is_that_without_the_points(robot, per):
 def test_targets_that_follow_are_not_judged(robot):
     """As with objective smr:2: the others have a weight that is nothing beside one."""
     case = shifted(robot, 0.1, 1e-3)
-    model, plain = FITTER(case.model.emphasise(np.array([1e-9, 1.0, 1e-9])), state_of(case.found))
+    model, plain = FITTER(
+        case.model.weight_targets(np.array([1e-9, 1.0, 1e-9])), state_of(case.found)
+    )
     judged = np.array([False, True, False])
-    found = robust_fit(FITTER, model, plain, case.data.line, "tukey", judged=judged)
+    found = fit_robust_loss(FITTER, model, plain, case.data.line, "tukey", is_judged=judged)
     assert {one.target for one in found.suspects} == {"smr2"}
     assert (case.listed(found)[1] == case.bad[1]).all()
     assert (found.weights[~judged] == 1.0).all()
@@ -332,13 +353,13 @@ def test_targets_that_follow_are_not_judged(robot):
 def test_a_pose_has_the_least_weight_of_its_targets(robot):
     case = shifted(robot, 0.1, 1e-3)
     found = case.robust("tukey")
-    assert_allclose(found.by_pose.weight, np.tile(found.weights.min(axis=0), (3, 1)))
+    assert_allclose(found.model_weighted_by_pose.weight, np.tile(found.weights.min(axis=0), (3, 1)))
 
 
 def test_rounds_that_do_not_settle_are_told(robot, monkeypatch):
-    monkeypatch.setattr(robust, "MAX_ROUNDS", 1)
+    monkeypatch.setattr(robust_fit, "MAX_REWEIGHTING_ROUNDS", 1)
     found = shifted(robot, 0.1, 1e-3, poses=30).robust("huber")
-    assert found.found.status == ("iteration_limit",)
+    assert found.least_squares.status == ("iteration_limit",)
 
 
 def test_a_plain_fit_that_diverged_stays_what_it_is(robot):
@@ -349,7 +370,7 @@ def test_a_plain_fit_that_diverged_stays_what_it_is(robot):
     )
     failed = replace(case.found, x=lost.batch(), cost=np.array([np.nan]), status=(Status.FAILED,))
     found = replace(case, found=failed).robust("tukey", 0.1)
-    assert found.found.status == ("failed",)
+    assert found.least_squares.status == ("failed",)
     assert not found.suspects
     assert found.weights.all()
 
@@ -467,9 +488,11 @@ def test_moments_are_those_of_the_chi_distribution(robot, name):
     """At the truth itself the distances are sigma chi_3; 15000 of them leave 2 % of chance."""
     case = shifted(robot, 0.0, 0.0, poses=5000, seed=3)
     state = case.without()
-    derivative, square = moments(case.model, state, name, NOISE)
+    derivative, square = loss_moments(case.model, state, name, NOISE)
     assert_allclose(derivative**2 * NOISE**2 / square, 0.95, rtol=0.02)
-    one, plain = moments(case.model, state, "square", np.nan)
+    one, plain = loss_moments(case.model, state, "square", np.nan)
     assert_allclose(one, 1.0)
-    assert_allclose(plain, case.model.cost(state) / (3.0 * case.model.counts), rtol=1e-12)
+    assert_allclose(
+        plain, case.model.target_costs(state) / (3.0 * case.model.pose_counts_by_target), rtol=1e-12
+    )
     assert_allclose(plain, NOISE**2, rtol=0.05)

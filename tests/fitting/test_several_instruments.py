@@ -12,14 +12,20 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
-from experiments.relative import NOISE, SIMULATORS, Arm
-from minimax_cal.evidence.noise import restricted
-from minimax_cal.fitting.opened import open_result
-from minimax_cal.fitting.several.fit import InstrumentFit, fit_instruments, laws_of
-from minimax_cal.fitting.several.kinds import relative
-from minimax_cal.fitting.several.linear import rows_of_all, scene_of_all
-from minimax_cal.fitting.several.options import RelativeOptions, silent
-from minimax_cal.fitting.several.result import RelativeCalibration
+from experiments.relative import MEASUREMENT_SIMULATORS, RELATIVE_LENGTH_NOISE, ImperfectArm
+from minimax_cal.fitting.multi_instrument.instrument_fit import (
+    InstrumentFit,
+    fit_instruments,
+    select_laws,
+)
+from minimax_cal.fitting.multi_instrument.linear_rows import (
+    build_common_arm_state,
+    build_instrument_rows,
+)
+from minimax_cal.fitting.multi_instrument.options import RelativeOptions, silent_progress
+from minimax_cal.fitting.multi_instrument.relative_calibration import relative
+from minimax_cal.fitting.multi_instrument.relative_result import RelativeCalibration
+from minimax_cal.fitting.opened_results import open_result
 from minimax_cal.instruments import (
     Instrument,
     Surface,
@@ -30,15 +36,16 @@ from minimax_cal.instruments import (
     read_relative,
     write_relative,
 )
-from minimax_cal.instruments.file import as_instrument
+from minimax_cal.instruments.instrument_files import convert_to_instrument
 from minimax_cal.instruments.sockets import reach
-from minimax_cal.measuring.history import with_history
-from minimax_cal.modelling.model import model_of
+from minimax_cal.measuring.visit_history import add_history_columns
+from minimax_cal.modelling.global_start import fit_base_and_targets
+from minimax_cal.modelling.point_model import build_point_model
 from minimax_cal.modelling.simulate import Truth, simulate
-from minimax_cal.modelling.start import fit_base
-from minimax_cal.robots.gravity import tubes
+from minimax_cal.robots.gravity_torques import assumed_link_masses_and_centres
+from minimax_cal.robots.joint_sampling import random_joint_values_above_floor
 from minimax_cal.robots.robot import robot_from_dict
-from minimax_cal.robots.sampling import random_poses
+from minimax_cal.selection.noise_model import estimate_noise_by_reml
 
 # ---- several instruments -------------------------------------------------------------------------
 
@@ -47,28 +54,32 @@ TOOL = np.array([[0.1, 0.0, 0.1], [0.0, 0.1, 0.1], [-0.1, -0.1, 0.2]])
 SEEDS = range(6)
 
 
-def tracker(arm: Arm, rng: np.random.Generator, poses: int, noise: float) -> mc.Measurements:
-    q = random_poses(arm.robot, poses, rng)
+def tracker(
+    arm: ImperfectArm, rng: np.random.Generator, poses: int, noise: float
+) -> mc.Measurements:
+    q = random_joint_values_above_floor(arm.robot, poses, rng)
     turn, shift = Rotation.random(rng=rng).as_matrix(), rng.normal(size=3)
-    return mc.measurements(q, arm.place(q) @ turn.T + shift + noise * rng.normal(size=(poses, 3)))
+    return mc.measurements(
+        q, arm.target_positions(q) @ turn.T + shift + noise * rng.normal(size=(poses, 3))
+    )
 
 
-def missed(arm: Arm, robot: mc.Robot) -> float:
+def missed(arm: ImperfectArm, robot: mc.Robot) -> float:
     """RMS error of fresh poses of three points of a tool, base and tool fitted [mm]."""
-    q = random_poses(arm.robot, 300, np.random.default_rng(98))
+    q = random_joint_values_above_floor(arm.robot, 300, np.random.default_rng(98))
     pose = arm.real.pose(q)
     y = np.einsum("mij,kj->mki", pose[:, :3, :3], TOOL) + pose[:, None, :3, 3]
-    fit = fit_base(model_of(robot, mc.measurements(q, y)), robot.mdh)
+    fit = fit_base_and_targets(build_point_model(robot, mc.measurements(q, y)), robot.mdh)
     return float(1e3 * np.sqrt(fit.mean_square))
 
 
 @cache
 def errors(name: str, seed: int) -> tuple[float, ...]:
     """Of the tracker, sockets, wires, tracker and sockets, tracker and wires."""
-    arm, rng = Arm.of(name, seed, 0.0), np.random.default_rng([seed, 77])
-    seen = tracker(arm, rng, 60, NOISE)
-    sockets = SIMULATORS["closures_known"](arm, rng, 60, NOISE)
-    wires = SIMULATORS["wires_3"](arm, rng, 60, NOISE).data
+    arm, rng = ImperfectArm.draw(name, seed, 0.0), np.random.default_rng([seed, 77])
+    seen = tracker(arm, rng, 60, RELATIVE_LENGTH_NOISE)
+    sockets = MEASUREMENT_SIMULATORS["closures_known"](arm, rng, 60, RELATIVE_LENGTH_NOISE)
+    wires = MEASUREMENT_SIMULATORS["wires_3"](arm, rng, 60, RELATIVE_LENGTH_NOISE).data
     known = {"known_distances": sockets.known}
     alone = mc.calibrate(arm.robot, seen, objective="sum", simulated=True)
     fits = (
@@ -97,12 +108,12 @@ def test_a_rough_instrument_does_not_spoil_a_fine_one():
     """Each counts by its own noise: alike, wires 13 times as rough would triple the error."""
     ratios = []
     for seed in SEEDS:
-        arm, rng = Arm.of("irb2600", seed, 0.0), np.random.default_rng([seed, 78])
-        seen = tracker(arm, rng, 60, NOISE)
-        wires = SIMULATORS["wires_3"](arm, rng, 60, 200e-6).data
+        arm, rng = ImperfectArm.draw("irb2600", seed, 0.0), np.random.default_rng([seed, 78])
+        seen = tracker(arm, rng, 60, RELATIVE_LENGTH_NOISE)
+        wires = MEASUREMENT_SIMULATORS["wires_3"](arm, rng, 60, 200e-6).data
         fit = relative(arm.robot, [seen, wires])
         noises = {one.kind: one.noise for one in fit.instruments}
-        assert noises["points"] == pytest.approx(NOISE, rel=0.25)
+        assert noises["points"] == pytest.approx(RELATIVE_LENGTH_NOISE, rel=0.25)
         assert noises["distances"] == pytest.approx(200e-6, rel=0.25)
         alone = mc.calibrate(arm.robot, seen, objective="sum", simulated=True)
         ratios.append(missed(arm, fit.robot) / missed(arm, alone.robot))
@@ -111,8 +122,11 @@ def test_a_rough_instrument_does_not_spoil_a_fine_one():
 
 
 def test_a_noise_that_is_given_counts_instead_of_the_residuals():
-    arm, rng = Arm.of("irb2600", 2, 0.0), np.random.default_rng(3)
-    seen, wires = tracker(arm, rng, 40, NOISE), SIMULATORS["wires_3"](arm, rng, 60, NOISE).data
+    arm, rng = ImperfectArm.draw("irb2600", 2, 0.0), np.random.default_rng(3)
+    seen, wires = (
+        tracker(arm, rng, 40, RELATIVE_LENGTH_NOISE),
+        MEASUREMENT_SIMULATORS["wires_3"](arm, rng, 60, RELATIVE_LENGTH_NOISE).data,
+    )
     plain = relative(arm.robot, [seen, wires])
     told = relative(arm.robot, [seen, wires], noises={"distances": "0.3mm"})
     assert [one.noise for one in told.instruments][1] == pytest.approx(3e-4, rel=1e-9)
@@ -129,17 +143,19 @@ def test_a_noise_that_is_given_counts_instead_of_the_residuals():
 
 
 @cache
-def all_kinds() -> tuple[Arm, RelativeCalibration]:
-    arm, rng = Arm.of("ur10", 3, 0.0), np.random.default_rng(6)
+def all_kinds() -> tuple[ImperfectArm, RelativeCalibration]:
+    arm, rng = ImperfectArm.draw("ur10", 3, 0.0), np.random.default_rng(6)
     kinds = ("closures", "wires_1", "poses")
-    data = [SIMULATORS[kind](arm, rng, 60, NOISE).data for kind in kinds]
-    return arm, relative(arm.robot, [tracker(arm, rng, 40, NOISE), *data])
+    data = [
+        MEASUREMENT_SIMULATORS[kind](arm, rng, 60, RELATIVE_LENGTH_NOISE).data for kind in kinds
+    ]
+    return arm, relative(arm.robot, [tracker(arm, rng, 40, RELATIVE_LENGTH_NOISE), *data])
 
 
 def test_without_noise_all_kinds_together_find_the_true_arm():
-    arm, rng = Arm.of("ur10", 3, 0.0), np.random.default_rng(6)
+    arm, rng = ImperfectArm.draw("ur10", 3, 0.0), np.random.default_rng(6)
     kinds = ("closures", "wires_1", "poses")
-    data = [SIMULATORS[kind](arm, rng, 60, 0.0).data for kind in kinds]
+    data = [MEASUREMENT_SIMULATORS[kind](arm, rng, 60, 0.0).data for kind in kinds]
     fit = relative(arm.robot, [tracker(arm, rng, 40, 0.0), *data])
     assert fit.status == "converged"
     assert missed(arm, fit.robot) < 1e-5
@@ -148,11 +164,13 @@ def test_without_noise_all_kinds_together_find_the_true_arm():
 
 def test_what_only_one_instrument_determines_is_said():
     """A tracker that saw the last joints still gives the base, and wires alone see the wrist."""
-    arm, rng = Arm.of("irb2600", 0, 0.0), np.random.default_rng(4)
-    sockets = SIMULATORS["closures"](arm, rng, 60, NOISE).data
-    q = random_poses(arm.robot, 60, rng)
+    arm, rng = ImperfectArm.draw("irb2600", 0, 0.0), np.random.default_rng(4)
+    sockets = MEASUREMENT_SIMULATORS["closures"](arm, rng, 60, RELATIVE_LENGTH_NOISE).data
+    q = random_joint_values_above_floor(arm.robot, 60, rng)
     q[:, 3:] = q[0, 3:]
-    seen = mc.measurements(q, arm.place(q) + NOISE * rng.normal(size=(60, 3)))
+    seen = mc.measurements(
+        q, arm.target_positions(q) + RELATIVE_LENGTH_NOISE * rng.normal(size=(60, 3))
+    )
     fit = relative(arm.robot, [seen, sockets])
     told = {one.name: one for one in fit.instruments}
     assert "a5" in told["closures"].alone  # the tracker saw no turn of the wrist
@@ -177,7 +195,7 @@ def test_the_result_lists_each_file_and_comes_back(tmp_path):
         low, high = held["rms_ci95_mm"]
         assert low < held["rms_mm"] < high
         assert held["rms_mm"] < 0.1 * one["accuracy"]["nominal"]["rms_mm"]
-        assert one["noise"] == pytest.approx(1e3 * NOISE, rel=0.5)
+        assert one["noise"] == pytest.approx(1e3 * RELATIVE_LENGTH_NOISE, rel=0.5)
     again = RelativeCalibration.from_dict(content)
     assert [one.name for one in again.instruments] == [one.name for one in fit.instruments]
     assert again.files_table().text(100) == fit.files_table().text(100)
@@ -187,8 +205,11 @@ def test_the_result_lists_each_file_and_comes_back(tmp_path):
 
 
 def test_files_are_one_fit_and_named_by_their_stems(tmp_path):
-    arm, rng = Arm.of("irb2600", 1, 0.0), np.random.default_rng(2)
-    seen, sockets = tracker(arm, rng, 40, NOISE), SIMULATORS["closures"](arm, rng, 60, NOISE).data
+    arm, rng = ImperfectArm.draw("irb2600", 1, 0.0), np.random.default_rng(2)
+    seen, sockets = (
+        tracker(arm, rng, 40, RELATIVE_LENGTH_NOISE),
+        MEASUREMENT_SIMULATORS["closures"](arm, rng, 60, RELATIVE_LENGTH_NOISE).data,
+    )
     mc.write_measurements(tmp_path / "tracker.csv", seen)
     write_relative(tmp_path / "sockets.csv", sockets)
     files = [tmp_path / "tracker.csv", tmp_path / "sockets.csv"]
@@ -204,8 +225,11 @@ def test_files_are_one_fit_and_named_by_their_stems(tmp_path):
 
 
 def test_a_slip_in_one_of_several_files_is_named():
-    arm, rng = Arm.of("irb2600", 1, 0.0), np.random.default_rng(2)
-    seen, sockets = tracker(arm, rng, 40, NOISE), SIMULATORS["closures"](arm, rng, 60, NOISE).data
+    arm, rng = ImperfectArm.draw("irb2600", 1, 0.0), np.random.default_rng(2)
+    seen, sockets = (
+        tracker(arm, rng, 40, RELATIVE_LENGTH_NOISE),
+        MEASUREMENT_SIMULATORS["closures"](arm, rng, 60, RELATIVE_LENGTH_NOISE).data,
+    )
     metres = mc.measurements(seen.q, 1e-3 * seen.y)
     with pytest.raises(mc.DataError, match="points look like metres given as millimetres"):
         relative(arm.robot, [metres, sockets])
@@ -225,26 +249,35 @@ def test_a_slip_in_one_of_several_files_is_named():
 
 COMPLIANCE = 3e-7  # of every joint [rad/(N m)]
 PLAIN = mc.load_robot("irb2600")
-MASS, COM = tubes(PLAIN.mdh)
+MASS, COM = assumed_link_masses_and_centres(PLAIN.mdh)
 TOLD = replace(PLAIN, mass=np.maximum(MASS, 1.0), com=COM)  # one compliance a joint
 ASKED = ("joint_compliance:J2", "joint_compliance:J3")
 SEVERAL = (*ASKED, "link_bending:L2", "base_flex", "gear_error:J1:turns=1")
 
 
-def arm_of(seed: int) -> Arm:
-    return Arm(TOLD, TOLD.with_mdh(Arm.of("irb2600", seed, 0.0).real.mdh), COMPLIANCE)
+def arm_of(seed: int) -> ImperfectArm:
+    return ImperfectArm(
+        TOLD, TOLD.with_mdh(ImperfectArm.draw("irb2600", seed, 0.0).real.mdh), COMPLIANCE
+    )
 
 
-def tracked(arm: Arm, rng: np.random.Generator, poses: int) -> Instrument:
-    q = random_poses(arm.robot, poses, rng)
+def tracked(arm: ImperfectArm, rng: np.random.Generator, poses: int) -> Instrument:
+    q = random_joint_values_above_floor(arm.robot, poses, rng)
     turn, shift = Rotation.random(rng=rng).as_matrix(), rng.normal(size=3)
-    y = arm.place(q) @ turn.T + shift + NOISE * rng.normal(size=(poses, 3))
-    return as_instrument(mc.measurements(q, y))
+    y = (
+        arm.target_positions(q) @ turn.T
+        + shift
+        + RELATIVE_LENGTH_NOISE * rng.normal(size=(poses, 3))
+    )
+    return convert_to_instrument(mc.measurements(q, y))
 
 
-def plates(arm: Arm, rng: np.random.Generator, count: int) -> Instrument:
+def plates(arm: ImperfectArm, rng: np.random.Generator, count: int) -> Instrument:
     """Contacts with four planes that stand where the ball happened to be: no pose is special."""
-    q, labels = random_poses(arm.robot, 4 * count, rng), np.repeat(list("ABCD"), count)
+    q, labels = (
+        random_joint_values_above_floor(arm.robot, 4 * count, rng),
+        np.repeat(list("ABCD"), count),
+    )
     return contacts(q, labels, [Surface(label) for label in "ABCD"])
 
 
@@ -252,25 +285,29 @@ KINDS = ("tracker", "wires_3", "closures_known", "poses")
 
 
 @cache
-def measured(seed: int, kinds: tuple[str, ...]) -> tuple[Arm, tuple[Instrument, ...], tuple]:
+def measured(
+    seed: int, kinds: tuple[str, ...]
+) -> tuple[ImperfectArm, tuple[Instrument, ...], tuple]:
     arm, rng = arm_of(seed), np.random.default_rng([seed, 5])
     data, known = [], ()
     for kind in kinds:
         if kind == "tracker":
             data.append(tracked(arm, rng, 60))
             continue
-        made = SIMULATORS[kind](arm, rng, 100, NOISE)
+        made = MEASUREMENT_SIMULATORS[kind](arm, rng, 100, RELATIVE_LENGTH_NOISE)
         data.append(made.data)
         known = made.known or known
     return arm, tuple(data), known
 
 
-def fitted(kinds: tuple[str, ...], effects: tuple[str, ...] = ()) -> tuple[Arm, InstrumentFit]:
+def fitted(
+    kinds: tuple[str, ...], effects: tuple[str, ...] = ()
+) -> tuple[ImperfectArm, InstrumentFit]:
     arm, data, known = measured(0, kinds)
-    every = [replace(each, at=with_history(each.at)) for each in data]
+    every = [replace(each, at=add_history_columns(each.at)) for each in data]
     trains = {f"file{i}": each for i, each in enumerate(every)}
     options = RelativeOptions(known_distances=known, effects=effects)
-    return arm, fit_instruments(arm.robot, trains, options, silent)
+    return arm, fit_instruments(arm.robot, trains, options, silent_progress)
 
 
 @pytest.mark.parametrize("kind", [*KINDS, "contacts"])
@@ -281,25 +318,27 @@ def test_the_rows_of_an_arm_that_gives_way_have_its_derivative(kind):
     """
     arm, rng = arm_of(1), np.random.default_rng(3)
     if kind == "contacts":
-        data = [replace(plates(arm, rng, 30), at=with_history(plates(arm, rng, 30).at))]
+        data = [replace(plates(arm, rng, 30), at=add_history_columns(plates(arm, rng, 30).at))]
         options = RelativeOptions(fix=("*",))
-        fit = fit_instruments(arm.robot, {"plates": data[0]}, options, silent)
+        fit = fit_instruments(arm.robot, {"plates": data[0]}, options, silent_progress)
     else:
         arm, fit = fitted((kind,))
-    laws = laws_of(arm.robot, fit, SEVERAL)
-    stack, x = fit.stack.bent(arm.robot, laws, fit.state)
-    first = stack.names.geometric
-    turns = [name.startswith("base_r") for name in stack.names.all]
+    laws = select_laws(arm.robot, fit, SEVERAL)
+    stack, x = fit.stack.with_laws(arm.robot, laws, fit.state)
+    first = stack.names.geometric_count
+    turns = [name.startswith("base_r") for name in stack.names.all_names]
     active = stack.movable & ~np.array(turns)
     size = np.abs(stack.rows(x, active)[1][-len(laws.names) :]).max(axis=1)
-    x.effects[stack.lawless - first :] = 1e-5 * rng.normal(size=len(size)) / size  # some 10 um
+    x.effects[stack.parameter_count_without_laws - first :] = (
+        1e-5 * rng.normal(size=len(size)) / size
+    )  # some 10 um
     _, slope = stack.rows(x, active)
     for row, at in zip(slope, np.flatnonzero(active), strict=True):
-        step, size = np.zeros(stack.names.count), max(float(np.abs(row).max()), 1.0)
+        step, size = np.zeros(stack.names.parameter_count), max(float(np.abs(row).max()), 1.0)
         step[at] = 1e-6 / size
         ends = [stack.rows(x.step(sign * step), ~active)[0] for sign in (1, -1)]
         assert_allclose(
-            row / size, (ends[1] - ends[0]) / 2e-6, atol=3e-8, err_msg=stack.names.all[at]
+            row / size, (ends[1] - ends[0]) / 2e-6, atol=3e-8, err_msg=stack.names.all_names[at]
         )
 
 
@@ -307,12 +346,16 @@ def test_an_arm_at_other_poses_gives_way_by_the_same_laws():
     """At the training poses `at_rows_of` predicts what the rows do."""
     for kind in KINDS:
         arm, fit = fitted((kind,), ASKED)
-        data = next(iter(fit.trains.values()))
-        stack, x = fit.stack, fit.stack.part(fit.state, 0)
-        block = stack.blocks[0].at_rows_of(arm.robot, data, stack.laws, x)
+        data = next(iter(fit.training_data.values()))
+        stack, x = fit.stack, fit.stack.state_of_block(fit.state, 0)
+        block = stack.blocks[0].with_measurements(arm.robot, data, stack.laws, x)
         held = np.zeros(data.poses, dtype=bool)
-        error = block.instrument.errors(block.flange(x), block.own(x), held)
-        assert 0.5 * NOISE < np.sqrt(np.nanmean(error**2)) < 2.0 * NOISE
+        error = block.instrument.part_errors(block.flange(x), block.own_values(x), held)
+        assert (
+            0.5 * RELATIVE_LENGTH_NOISE
+            < np.sqrt(np.nanmean(error**2))
+            < 2.0 * RELATIVE_LENGTH_NOISE
+        )
 
 
 PULLED = (("wires_3",), ("closures_known",), ("poses",), ("tracker", "closures_known"))
@@ -324,7 +367,7 @@ def test_the_compliance_is_found_to_its_sigma(kinds):
     for seed in range(5):
         arm, data, known = measured(seed, kinds)
         fit = relative(arm.robot, list(data), known_distances=known, effects=ASKED)
-        found = [p for p in fit.parameters if p.of_effect]
+        found = [p for p in fit.parameters if p.is_of_effect]
         assert [p.name for p in found] == ["joint_compliance:J2.c2", "joint_compliance:J3.c3"]
         assert all(p.sigma < 0.3 * COMPLIANCE for p in found)
         pulls += [(p.value - COMPLIANCE) / p.sigma for p in found]
@@ -339,17 +382,17 @@ def test_with_its_effects_an_arm_is_met_as_no_stiff_one_is():
         bent = relative(arm.robot, list(data), known_distances=known, effects=ASKED)
         before, after = (fit.accuracy["holdout"].rms_mm for fit in (plain, bent))
         assert after < 0.6 * before
-        assert after < 2.5e3 * NOISE
+        assert after < 2.5e3 * RELATIVE_LENGTH_NOISE
         # the robot of the file is that of geometry alone
         assert_allclose(bent.robot.mdh, plain.robot.mdh, rtol=0, atol=1e-12)
         assert plain.cell is None
 
 
 def test_a_joint_that_does_not_give_way_rests_at_its_bound():
-    arm, rng = Arm(TOLD, arm_of(2).real, -2e-7), np.random.default_rng(8)
-    data = SIMULATORS["wires_3"](arm, rng, 100, NOISE).data
+    arm, rng = ImperfectArm(TOLD, arm_of(2).real, -2e-7), np.random.default_rng(8)
+    data = MEASUREMENT_SIMULATORS["wires_3"](arm, rng, 100, RELATIVE_LENGTH_NOISE).data
     fit = relative(arm.robot, data, effects="joint_compliance:J2")
-    (found,) = (p for p in fit.parameters if p.of_effect)
+    (found,) = (p for p in fit.parameters if p.is_of_effect)
     assert (found.value, found.identifiable, found.reason) == (0.0, False, "at its bound")
 
 
@@ -360,16 +403,18 @@ def test_a_joint_that_does_not_give_way_rests_at_its_bound():
 def test_the_rows_of_evidence_estimate_what_the_fit_does(kinds):
     """One Gauss-Newton step from geometry alone, weighed alike, geometry projected out."""
     arm, fit = fitted(kinds)
-    scene = scene_of_all(arm.robot, fit)
-    rows = rows_of_all(scene, fit)
-    found = laws_of(arm.robot, fit, ASKED)
-    field = np.concatenate([term.columns(scene).displacement(scene) for term in found.terms])
-    columns = rows.of(field)
-    clear = columns - rows.basis @ (rows.basis.T @ columns)
+    scene = build_common_arm_state(arm.robot, fit)
+    rows = build_instrument_rows(scene, fit)
+    found = select_laws(arm.robot, fit, ASKED)
+    field = np.concatenate(
+        [term.columns(scene).target_displacements(scene) for term in found.terms]
+    )
+    columns = rows.rows_from_fields(field)
+    clear = columns - rows.nuisance_basis @ (rows.nuisance_basis.T @ columns)
     value = np.linalg.lstsq(clear, rows.error, rcond=None)[0]
-    stack, x = fit.stack.bent(arm.robot, found, fit.state)
+    stack, x = fit.stack.with_laws(arm.robot, found, fit.state)
     active = np.pad(fit.identification.active, (0, 2), constant_values=True)
-    weight = np.sqrt(stack.weights(x))  # a known distance counts as a coordinate in evidence
+    weight = np.sqrt(stack.row_weights(x))  # a known distance counts as a coordinate in evidence
     error, slope = stack.rows(x, active)
     step = np.linalg.lstsq((slope / weight).T, error / weight, rcond=1e-12)[0]
     assert_allclose(value, step[-2:], rtol=1e-6)
@@ -378,17 +423,19 @@ def test_the_rows_of_evidence_estimate_what_the_fit_does(kinds):
 @pytest.mark.parametrize("kinds", [*((kind,) for kind in KINDS), KINDS])
 def test_the_rows_of_a_stiff_arm_have_the_noise_of_their_instruments(kinds):
     arm, fit = fitted(kinds, ASKED)
-    scene = scene_of_all(arm.robot, fit)
-    rows = rows_of_all(scene, fit)
-    noise = restricted(rows, np.zeros((len(rows.error), 0)))
+    scene = build_common_arm_state(arm.robot, fit)
+    rows = build_instrument_rows(scene, fit)
+    noise = estimate_noise_by_reml(rows, np.zeros((len(rows.error), 0)))
     assert noise.variance == pytest.approx(float(fit.noise.min()) ** 2, rel=0.2)
-    assert noise.jitter < 5e-6
+    assert noise.joint_jitter < 5e-6
     numbers = sum(
-        6 * one.poses if one.kind == "poses" else len(fit.stack.blocks[i].read(part).weights)
+        6 * one.poses
+        if one.kind == "poses"
+        else len(fit.stack.blocks[i].read_residual_rows(part).row_weights)
         for i, one in enumerate(fit.stack.instruments)
-        for part in [fit.stack.part(fit.state, i)]
+        for part in [fit.stack.state_of_block(fit.state, i)]
     )
-    assert rows.count == numbers
+    assert rows.measured_row_count == numbers
 
 
 # ---- the file ----------------------------------------------------------------------------------
@@ -406,11 +453,11 @@ def test_a_file_predicts_with_its_effects(tmp_path):
     assert again.geometric is not None
     assert_allclose(again.geometric.robot.mdh, fit.robot.mdh, rtol=0, atol=1e-12)
     seen = tracked(arm, np.random.default_rng(12), 80).at
-    cell, _, _ = again.placed_by(seen)
+    cell, _, _ = again.place_on_data(seen)
     stiff, _, _ = replace(again, rungs=(again.rungs[0], replace(
-        again.rungs[1], cell=again.geometric))).placed_by(seen)  # fmt: skip
+        again.rungs[1], cell=again.geometric))).place_on_data(seen)  # fmt: skip
     met, missed = (float(np.sqrt(np.mean(one.error(seen) ** 2))) for one in (cell, stiff))
-    assert met < 2.0 * NOISE < 0.5 * missed
+    assert met < 2.0 * RELATIVE_LENGTH_NOISE < 0.5 * missed
 
 
 def test_what_carries_no_effect_holds_the_geometry_fitted_alone(tmp_path):

@@ -13,11 +13,15 @@ from conftest import run, shared
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.fitting.checks import check_plausible, coarse_joints, fitted
-from minimax_cal.fitting.common_scale import common_share, scale_of
-from minimax_cal.fitting.unknown_arm import rough
-from minimax_cal.measuring import slips
-from minimax_cal.measuring.slips import mended
+from minimax_cal.fitting.common_scale import estimate_common_length_change, estimate_point_scale
+from minimax_cal.fitting.data_slips import (
+    check_plausible,
+    fit_base_to_nominal,
+    warn_of_coarse_joints,
+)
+from minimax_cal.fitting.unknown_arm import build_rough_robot
+from minimax_cal.measuring import file_mistakes
+from minimax_cal.measuring.file_mistakes import apply_mends
 from minimax_cal.modelling.simulate import Truth, simulate
 from minimax_cal.robots.robot import robot_from_dict
 
@@ -43,17 +47,23 @@ def clipped(data: mc.Measurements) -> mc.Measurements:
 
 
 SLIPS: dict[str, tuple[Callable[[mc.Measurements], mc.Measurements], str]] = {
-    "shifted": (lambda d: slips.with_points_moved(d, 1), "one row above its joints; .*shift=-1 -o"),
-    "by three": (lambda d: slips.with_points_moved(d, -3), "three rows below .*--mend shift=3 -o"),
-    "reversed": (slips.with_points_reversed, "in reverse order; .*--mend reverse -o"),
+    "shifted": (
+        lambda d: file_mistakes.with_points_shifted_by_rows(d, 1),
+        "one row above its joints; .*shift=-1 -o",
+    ),
+    "by three": (
+        lambda d: file_mistakes.with_points_shifted_by_rows(d, -3),
+        "three rows below .*--mend shift=3 -o",
+    ),
+    "reversed": (file_mistakes.with_points_reversed, "in reverse order; .*--mend reverse -o"),
     "lost": (lambda d: lost(d, 25), "from about this line .*--mend shift=-1@\\d+\\.\\. -o"),
     "stale": (stale, "points are those of the row before .* in 3 rows.*--leave-out 9,22,35 -o"),
     "joints": (
-        lambda d: slips.with_joints_ordered(d, [0, 2, 1, 3, 4, 5]),
+        lambda d: file_mistakes.with_joint_columns_ordered(d, [0, 2, 1, 3, 4, 5]),
         "columns of joints 2 and 3 look swapped; .*--mend joints=1:3:2:4:5:6 -o",
     ),
     "backwards": (
-        lambda d: slips.with_joints_ordered(d, [5, 4, 3, 2, 1, 0]),
+        lambda d: file_mistakes.with_joint_columns_ordered(d, [5, 4, 3, 2, 1, 0]),
         "joint columns look like those of the joints in reverse order",
     ),
     "inches": (lambda d: d.with_y(d.y / 25.4), "look like inches given as mm: .*--units smr=in"),
@@ -73,7 +83,7 @@ def test_a_slip_is_named_with_its_mend(name, robot, noisy):
     assert time.process_time() - began < 2.0
     assert "\n" not in str(caught.value)
     if mend := re.search(r"--mend (\S+) ", str(caught.value)):
-        right = mended(wrong, [mend[1]])
+        right = apply_mends(wrong, [mend[1]])
         check_plausible(robot, right)
         assert right.poses >= noisy.data.poses - 6
 
@@ -119,7 +129,7 @@ def test_a_mended_file_calibrates(robot, noisy, tmp_path):
 @pytest.mark.parametrize("how", ["", "shift", "shift=0", "shift=1@900..", "joints=1", "scale=-1"])
 def test_what_no_mend_is(how, noisy):
     with pytest.raises(mc.OptionError, match="mend="):
-        mended(noisy.data, [how])
+        apply_mends(noisy.data, [how])
 
 
 def test_the_wrong_convention_is_named(noisy, robot):
@@ -140,7 +150,12 @@ def test_the_wrong_convention_is_named(noisy, robot):
 def test_a_common_scale_that_no_drawing_error_explains():
     robot = mc.load_robot("fanuc_r2000ic_165f")
     good = simulate(robot, 80, 3, seed=3, truth=Truth(length=0.1e-3, angle=0.2e-3, compliance=0))
-    assert abs(scale_of(robot, good.data, fitted(robot, good.data).state).gain) < 16.0
+    assert (
+        abs(
+            estimate_point_scale(robot, good.data, fit_base_to_nominal(robot, good.data).state).gain
+        )
+        < 16.0
+    )
     with pytest.raises(mc.DataError, match=r"points lie 1\.00\d+ times .*--mend scale=0\.99"):
         mc.calibrate(robot, good.data.with_y(1.003 * good.data.y))
 
@@ -153,7 +168,7 @@ def test_a_scale_is_named_only_where_links_cannot_do_it(seed):
     mdh[:, 1] = [0.4, 0.15, 0.5, 0.0, 0.0, 0.1]
     mdh[:, 3] = [-half, half, 0.0, -half, half, 0.0]
     slide = np.arange(6) == 2
-    robot = replace(rough("six joints", mdh, slide), rough=False)
+    robot = replace(build_rough_robot("six joints", mdh, slide), rough=False)
     twists = np.zeros((6, 5))
     twists[:, 3] = 0.036 * rng.choice([-1.0, 1.0], 6)
     q = rng.uniform(-1.0, 1.0, (60, 6)) * np.where(slide, 0.4, 2.0)
@@ -182,13 +197,15 @@ def test_lengths_that_are_off_at_random_have_no_common_share():
     named = 0
     for _ in range(1000):
         change = rng.normal(size=drawn.shape) * ([0.5e-3] * 2 + [1e-3] * 3)
-        named += common_share(drawn, change, found, sure) != 0.0
+        named += estimate_common_length_change(drawn, change, found, sure) != 0.0
     assert named < 10  # one in a hundred
     stretched = 1e-3 * drawn * ([1.0] * 2 + [0.0] * 3)
-    assert_allclose(common_share(drawn, stretched, found, sure), 1e-3, rtol=1e-9)
-    assert common_share(drawn, 0.5 * stretched, found, sure) == 0.0  # a warm arm does so
+    assert_allclose(estimate_common_length_change(drawn, stretched, found, sure), 1e-3, rtol=1e-9)
+    assert (
+        estimate_common_length_change(drawn, 0.5 * stretched, found, sure) == 0.0
+    )  # a warm arm does so
     unsure = np.diag(np.full(drawn.size, 3e-3**2))
-    assert common_share(drawn, stretched, found, unsure) == 0.0
+    assert estimate_common_length_change(drawn, stretched, found, unsure) == 0.0
 
 
 def test_an_arm_that_bends_is_not_told_to_be_seen_in_another_scale():
@@ -208,10 +225,12 @@ def test_an_arm_that_bends_is_not_told_to_be_seen_in_another_scale():
 
 def test_rounded_joints_are_noticed_where_rounding_can_cost_what_is_missing(robot, noisy):
     rounded = replace(noisy.data, q=np.radians(np.round(np.degrees(noisy.data.q))))
-    said = coarse_joints(robot, rounded, check_plausible(robot, rounded))
+    said = warn_of_coarse_joints(robot, rounded, check_plausible(robot, rounded))
     assert "joint values are whole degrees" in said
     exact = noisy.cell.predict(rounded.q)  # commanded so: nothing is missing
-    assert not coarse_joints(robot, rounded.with_y(exact), fitted(robot, rounded.with_y(exact)))
+    assert not warn_of_coarse_joints(
+        robot, rounded.with_y(exact), fit_base_to_nominal(robot, rounded.with_y(exact))
+    )
 
 
 def sound(seed: int) -> tuple[mc.Robot, mc.Measurements]:

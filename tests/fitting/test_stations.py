@@ -9,11 +9,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
-from minimax_cal.fitting.calibrate import again
-from minimax_cal.fitting.stations import jumps
-from minimax_cal.measuring.stations import stood
-from minimax_cal.modelling.cell import strangers
-from minimax_cal.modelling.effects.table import NOTHING
+from minimax_cal.fitting.calibrate import refit_with_options
+from minimax_cal.fitting.session_frames import base_poses_in_sessions
+from minimax_cal.measuring.session_frames import instrument_positions
+from minimax_cal.modelling.cell import list_session_and_time_notices
+from minimax_cal.modelling.effects.table import NO_EFFECTS
 
 # ---- stations ------------------------------------------------------------------------------------
 
@@ -69,16 +69,18 @@ def test_two_stations_calibrate_as_well_as_one(objective):
 def test_the_station_is_found(saved):
     """Points of the second station, in the first one's frame, are those it would have measured."""
     fit, _ = saved
-    common = fit.cell.placed(TWO)
+    common = fit.cell.align_to_first_session(TWO)
     assert list(fit.cell.sessions.frames) == ["monday", "tuesday"]
     assert_allclose(common.y, ONE.y, rtol=0, atol=30e-6)  # sigma of a frame, three metres away
-    truth = jumps(fit.cell.sessions.frames, fit.cell.base)
-    told = [p for p in fit.parameters if p.of_effect]
+    truth = base_poses_in_sessions(fit.cell.sessions.frames, fit.cell.base)
+    told = [p for p in fit.parameters if p.is_of_effect]
     assert_allclose([p.value for p in told], truth, rtol=1e-12)
     assert all(0.0 < p.sigma < 3e-5 for p in told)
-    assert_allclose(stood(common)[SESSION == "monday"], 0.0, atol=EXACT)
+    assert_allclose(instrument_positions(common)[SESSION == "monday"], 0.0, atol=EXACT)
     away = np.linalg.inv(fit.cell.sessions.frames["tuesday"])[:3, 3]
-    assert_allclose(np.linalg.norm(stood(common)[1]), np.linalg.norm(away), rtol=1e-12)
+    assert_allclose(
+        np.linalg.norm(instrument_positions(common)[1]), np.linalg.norm(away), rtol=1e-12
+    )
 
 
 def test_a_saved_fit_places_each_session(saved):
@@ -95,16 +97,16 @@ def test_a_saved_fit_places_each_session(saved):
         atol=1e-9,
     )
     assert mc.evaluate(cell, TWO).rms_mm < 1.05 * mc.evaluate(cell, ONE).rms_mm
-    assert strangers(cell, TWO) == ()
-    (said,) = strangers(cell, labelled(TWO, np.full(120, "friday")))
+    assert list_session_and_time_notices(cell, TWO) == ()
+    (said,) = list_session_and_time_notices(cell, labelled(TWO, np.full(120, "friday")))
     assert "session friday is new to the fit" in said
-    (said,) = strangers(cell, ONE)
+    (said,) = list_session_and_time_notices(cell, ONE)
     assert "no session is named" in said
 
 
 def test_a_fit_of_stations_is_as_good_a_source_as_any(saved):
     fit, path = saved
-    other = again(fit, objective="sum")
+    other = refit_with_options(fit, objective="sum")
     assert len(other.parameters) == len(fit.parameters)
     found = mc.bootstrap(other, 20)
     assert found.lost == 0
@@ -195,24 +197,27 @@ def test_a_part_read_as_a_file_of_its_own_has_the_time_of_the_fit(tmp_path):
     cell = mc.load_cell(tmp_path / "fit.json")
     late = np.arange(120) >= 96
     assert_allclose(cell.error(ONE.take(late)), fit.error[late], rtol=0, atol=1e-9)
-    assert strangers(cell, ONE.take(late)) == ()
+    assert list_session_and_time_notices(cell, ONE.take(late)) == ()
     later = replace(ONE, columns={"order": ONE.columns["order"] + 1000})
-    (said,) = strangers(cell, later)
+    (said,) = list_session_and_time_notices(cell, later)
     assert "extrapolated: by order these poses lie from 8.4 to 9.4" in said
-    (said,) = strangers(cell, replace(ONE, columns={}))
+    (said,) = list_session_and_time_notices(cell, replace(ONE, columns={}))
     assert "does not run here" in said
 
 
 def test_play_on_data_without_an_order_is_told():
     cell = mc.calibrate(ROBOT, ONE, "sum", effects=["backlash:all"]).cell
-    assert strangers(cell, ONE) == ()
+    assert list_session_and_time_notices(cell, ONE) == ()
     unordered = replace(ONE, columns={})
-    (said,) = strangers(cell, unordered)
+    (said,) = list_session_and_time_notices(cell, unordered)
     assert (
         "backlash of the whole arm depends on the way to a pose, which these data do not tell"
         in said
     )
-    assert strangers(cell, replace(ONE, columns={"approach2": np.ones(ONE.poses)})) == ()
+    assert (
+        list_session_and_time_notices(cell, replace(ONE, columns={"approach2": np.ones(ONE.poses)}))
+        == ()
+    )
 
 
 # ---- between sessions ----------------------------------------------------------------------------
@@ -313,7 +318,7 @@ def test_a_fit_of_the_change_meets_the_noise_and_the_next_campaign(knocked):
     held = mc.deliver(freed, "dh-csv")  # the arm as it was last is a geometry
     assert held.carries == ("encoder_zero:J3",)
     assert held.cell.robot is freed.cell.robot
-    at_rest = replace(freed.cell, robot=held.cell.robot, effects=NOTHING)
+    at_rest = replace(freed.cell, robot=held.cell.robot, effects=NO_EFFECTS)
     assert_allclose(at_rest.predict(later), freed.cell.predict(later), rtol=0, atol=1e-12)
 
 

@@ -12,23 +12,23 @@ from problems_robust import NOISE, Case, fit, misread, shifted, state_of
 from scipy import stats
 
 import minimax_cal as mc
-from minimax_cal.fitting.suspects import (
+from minimax_cal.core.arrays import Array
+from minimax_cal.core.files import to_plain_json
+from minimax_cal.fitting.outliers import (
     FALSE_DISCOVERY_RATE,
-    Scores,
-    Spread,
+    PointScores,
+    StudentSpread,
+    estimate_spread,
     find_contradicting_points,
     fit_log_scale,
-    nearest,
-    scores,
-    spread_of,
-    unlikely,
+    nearest_revisits,
+    reject_by_false_discovery_rate,
+    standardised_point_scores,
 )
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.files import plain
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.modelling.model import Prior
+from minimax_cal.modelling.point_model import GaussianPrior
 from minimax_cal.modelling.simulate import Truth, simulate
-from minimax_cal.solvers.scalar import least_between
+from minimax_cal.solvers.scalar_minimum import minimise_scalar_between
 
 # ---- suspects ------------------------------------------------------------------------------------
 
@@ -36,24 +36,28 @@ from minimax_cal.solvers.scalar import least_between
 # ---- leverage --------------------------------------------------------------------------------
 
 
-def plain_scores(case: Case) -> Scores:
-    return scores(case.model, state_of(case.found), case.model.seen.astype(float))
+def plain_scores(case: Case) -> PointScores:
+    return standardised_point_scores(
+        case.model, state_of(case.found), case.model.measured_mask.astype(float)
+    )
 
 
 def test_covariance_is_that_of_the_whole_hat_matrix(robot):
     """All rows at once, any weights, a prior: C from R R' with R = I - J A^-1 J' W."""
     case = shifted(robot, 0.0, 0.0, poses=12)
-    prior = np.zeros(case.model.names.count)
+    prior = np.zeros(case.model.names.parameter_count)
     prior[case.model.active] = np.random.default_rng(1).uniform(0.0, 0.2, case.model.active.sum())
     quality = np.random.default_rng(2).uniform(0.5, 2.0, case.model.weight.shape)
-    model = replace(case.model.with_prior(Prior(prior, prior)), weight=quality)
+    model = replace(case.model.with_prior(GaussianPrior(prior, prior)), weight=quality)
     weights = np.random.default_rng(0).choice(
         [0.0, 0.3, 1.0], size=quality.shape, p=[0.1, 0.4, 0.5]
     )
     state = state_of(case.found)
-    found = scores(model, state, weights)
+    found = standardised_point_scores(model, state, weights)
 
-    rows = np.swapaxes(model.jacobian(state)[..., model.active], 0, 1)  # as scores: targets first
+    rows = np.swapaxes(
+        model.point_jacobian(state)[..., model.active], 0, 1
+    )  # as scores: targets first
     rows = rows * np.sqrt(quality)[..., None, None]
     rows = rows.reshape(-1, model.active.sum())
     w = np.repeat(weights.reshape(-1), 3)
@@ -61,7 +65,7 @@ def test_covariance_is_that_of_the_whole_hat_matrix(robot):
     cover = np.linalg.inv(rows.T @ (w[:, None] * rows) + known)
     left = np.eye(len(rows)) - rows @ cover @ rows.T * w
     whole = left @ left.T + rows @ cover @ known @ cover @ rows.T
-    error = np.swapaxes(model.error(state), 0, 1) * np.sqrt(quality)[..., None]
+    error = np.swapaxes(model.point_errors(state), 0, 1) * np.sqrt(quality)[..., None]
     error = error.reshape(-1, 3)
     blocks = np.stack([whole[i : i + 3, i : i + 3] for i in range(0, len(rows), 3)])
     expected = np.einsum("na,nab,nb->n", error, np.linalg.inv(blocks), error)
@@ -77,10 +81,10 @@ def test_directions_that_the_fit_follows_are_not_judged(robot):
     weight[2, 1:] = 0.0
     model = replace(case.model, weight=weight)
     state = state_of(fit(model, state_of(case.found))[1])
-    found = scores(model, state, model.seen.astype(float))
+    found = standardised_point_scores(model, state, model.measured_mask.astype(float))
     assert found.directions[2, 0] == 0
     assert (found.directions[:2] == 3).all()
-    p_value = Spread(NOISE, 100.0).p_value(found)
+    p_value = StudentSpread(NOISE, 100.0).p_value(found)
     assert p_value[2, 0] == 1.0
     assert (p_value[2, 1:] == 1.0).all()  # never measured
 
@@ -89,12 +93,12 @@ def test_directions_that_the_fit_follows_are_not_judged(robot):
 
 
 @pytest.fixture(scope="module")
-def clean(robot: mc.Robot) -> list[tuple[Scores, float]]:
+def clean(robot: mc.Robot) -> list[tuple[PointScores, float]]:
     """Scores and spare degrees of freedom of 40 plain fits to clean points."""
     out = []
     for seed in range(40):
         case = shifted(robot, 0.0, 0.0, poses=25, seed=seed)
-        dof = 3.0 * case.model.counts.sum() - case.model.active.sum()
+        dof = 3.0 * case.model.pose_counts_by_target.sum() - case.model.active.sum()
         out.append((plain_scores(case), float(dof)))
     return out
 
@@ -110,15 +114,15 @@ def test_clean_points_are_rarely_listed(clean):
     """At most 1 % of the data sets have suspects; 4 of 40 would be a chance of 1 in 2000."""
     lists, low, count = 0, 0, 0
     for found, dof in clean:
-        p_value = spread_of(found, dof).p_value(found)
-        lists += bool(unlikely(p_value).any())
+        p_value = estimate_spread(found, dof).p_value(found)
+        lists += bool(reject_by_false_discovery_rate(p_value).any())
         low, count = low + int((p_value < 0.05).sum()), count + p_value.size
     assert stats.binom.sf(lists - 1, len(clean), FALSE_DISCOVERY_RATE) > 1e-3
     assert abs(low / count - 0.05) < 4.0 * np.sqrt(0.05 * 0.95 / count)
 
 
 def test_scale_is_that_of_the_noise(clean):
-    scale = [spread_of(found, dof).scale for found, dof in clean]
+    scale = [estimate_spread(found, dof).scale for found, dof in clean]
     assert_allclose(np.mean(scale), NOISE, rtol=0.02)
 
 
@@ -137,7 +141,7 @@ def test_the_likeliest_scale_is_where_the_density_is_largest(rng, tail):
         ratio = square / 3.0 / np.exp(2.0 * log_scale)
         return float(2.0 * 500 * log_scale - stats.f.logpdf(ratio, 3, tail).sum())
 
-    at, _ = least_between(loss, found - 1.0, found + 1.0, 1e-9)
+    at, _ = minimise_scalar_between(loss, found - 1.0, found + 1.0, 1e-9)
     assert abs(found - at) < 1e-6  # of a flat bottom no more is seen
 
 
@@ -147,11 +151,11 @@ def test_scale_and_tails_are_found_beside_outliers(rng, tail):
     for share in (0.0, 0.2):
         wrong = np.arange(2000)[None] < share * 2000
         mixed = np.where(wrong, (100.0 * NOISE) ** 2, square)
-        found = Scores(mixed, np.full(mixed.shape, 3))
-        spread = spread_of(found, 5000.0)
+        found = PointScores(mixed, np.full(mixed.shape, 3))
+        spread = estimate_spread(found, 5000.0)
         assert_allclose(spread.scale, NOISE, rtol=0.1)
         assert (spread.dof < 10.0) == (tail < 10.0)
-        listed = unlikely(spread.p_value(found))
+        listed = reject_by_false_discovery_rate(spread.p_value(found))
         # not so where the tails are heavy: a hundred sigma are then an ordinary point's right
         if tail > 4.0:
             assert listed[wrong].all()
@@ -162,8 +166,8 @@ def test_points_without_error_are_no_suspects(robot):
     """Rounding has tails too; no instrument tells less than a tenth of a micrometre."""
     exact = Truth(compliance=0.0, noise=0.0, noise_per_metre=0.0)
     assert not shifted(robot, 0.0, 0.0, truth=exact).robust("tukey").suspects
-    nothing = Scores(np.zeros((1, 4)), np.zeros((1, 4), dtype=int))
-    assert (spread_of(nothing, 1.0).p_value(nothing) == 1.0).all()
+    nothing = PointScores(np.zeros((1, 4)), np.zeros((1, 4), dtype=int))
+    assert (estimate_spread(nothing, 1.0).p_value(nothing) == 1.0).all()
 
 
 @settings(max_examples=60, deadline=None)
@@ -175,7 +179,7 @@ def test_lists_are_those_of_benjamini_and_hochberg(chances, level):
     )
     limit = sorted(chances)[longest - 1] if longest else -1.0
     expected = [p <= limit for p in chances]
-    assert unlikely(np.array(chances), level).tolist() == expected
+    assert reject_by_false_discovery_rate(np.array(chances), level).tolist() == expected
 
 
 # ---- lists -----------------------------------------------------------------------------------
@@ -203,8 +207,8 @@ def test_a_list_tells_where_and_how_far(robot):
         case, data=case.data.with_y(y), model=replace(case.model, y=np.moveaxis(y, 0, 2))
     )
     found = case.robust("tukey")
-    state = state_of(found.found)
-    distance = np.linalg.norm(found.plain.error(state), axis=-1)
+    state = state_of(found.least_squares)
+    distance = np.linalg.norm(found.unweighted_model.point_errors(state), axis=-1)
     line = case.data.line
     by_pose = {pose: [s for s in found.suspects if s.line == line[pose]] for pose in range(50)}
     assert [s.target for s in by_pose[alone]] == ["smr2"]
@@ -252,7 +256,7 @@ def test_the_nearest_other_visit_by_brute_force():
     rng = np.random.default_rng(4)
     points, group = rng.normal(size=(9, 2, 3)), np.array([0, 1, 0, 2, 0, 1, 3, 4, 4])
     points[8, 1] = np.nan
-    apart, other, amid = nearest(points, group)
+    apart, other, amid = nearest_revisits(points, group)
     for target in range(2):
         for row in range(9):
             rest = [i for i in np.flatnonzero(group == group[row]) if i != row]
@@ -390,7 +394,7 @@ def test_suspects_of_a_file_come_back(robot, noisy, tmp_path):
     again = mc.load_fit(tmp_path / "fit.json")
     keys = [[(s.line, s.target, s.held) for s in one.suspects] for one in (fit, again)]
     assert keys[0] == keys[1]
-    assert plain(again.beyond) == plain(fit.beyond)
+    assert to_plain_json(again.beyond) == to_plain_json(fit.beyond)
     assert again.trusted.rms_mm == pytest.approx(fit.trusted.rms_mm, rel=1e-9)
 
 

@@ -18,8 +18,8 @@ from pathlib import Path
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from experiments.record import run_record, save_json, table_record
-from minimax_cal.ground.tables import Table
+from experiments.study_record import build_run_record, table_to_json, write_json
+from minimax_cal.core.tables import Table
 
 from .cases import EACH, case, each_option
 from .running import GOOD, KINDS, Outcome, outcome, outcomes
@@ -34,7 +34,7 @@ def table_of(found: list[Outcome]) -> Table:
         for name in commands
     ]
     total = ("all", len(found), *(sum(count[n, kind] for n in commands) for kind in KINDS))
-    return Table.made("hostile runs of every command", [*rows, total],
+    return Table.from_rows("hostile runs of every command", [*rows, total],
                       "command | cases d", *(f"{kind} d" for kind in KINDS))  # fmt: skip
 
 
@@ -78,8 +78,8 @@ def main() -> int:
     print(table.markdown())
     if chosen.json:
         words = f"python -m tests.fuzz --cases {count} --seed {chosen.seed}"
-        made = run_record(words)
-        save_json(chosen.json, {"made": made, "tables": [table_record(table)]})
+        made = build_run_record(words)
+        write_json(chosen.json, {"made": made, "tables": [table_to_json(table)]})
     slowest = max(found, key=lambda each: each.seconds)
     print(f"seed {chosen.seed}, {time.perf_counter() - began:.0f} s; the slowest took "
           f"{slowest.seconds:.1f} s ({slowest.number} {slowest.command})")  # fmt: skip

@@ -10,7 +10,7 @@ from typing import Any
 import click
 import numpy as np
 
-from minimax_cal.cli.running import cli
+from minimax_cal.cli.command_runner import cli
 
 from .known import FATAL, HARMLESS, with_known
 from .material import material

@@ -16,9 +16,13 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
-from experiments.pixel_cells import board_points, make_cell, write_cell
+from experiments.pixel_cells import board_corner_points, simulate_pixel_cell, write_cell_files
 from minimax_cal.cli import main
-from minimax_cal.dynamics.regressor import Motion, inertial_parameters, inverse_dynamics
+from minimax_cal.dynamics.regressor import (
+    JointMotion,
+    build_nominal_inertial_parameters,
+    inverse_dynamics,
+)
 from minimax_cal.instruments.sockets import reach
 
 POSES = 24
@@ -117,8 +121,8 @@ def trajectories() -> None:
         phase = rate * t[:, None, None] + rng.uniform(0.0, 6.0, (3, 2))
         size = rng.uniform(0.2, 0.5, (3, 2))
         q, qd = (size * np.sin(phase)).sum(1), (size * rate * np.cos(phase)).sum(1)
-        motion = Motion(q, qd, -(size * rate**2 * np.sin(phase)).sum(1))
-        torque = inverse_dynamics(robot, motion, inertial_parameters(robot))
+        motion = JointMotion(q, qd, -(size * rate**2 * np.sin(phase)).sum(1))
+        torque = inverse_dynamics(robot, motion, build_nominal_inertial_parameters(robot))
         torque += np.sign(qd) * [3.0, 1.5] + 2.0 * qd + 0.1 * rng.normal(size=q.shape)
         header = ["t_s", *(f"{kind.format(j)}" for kind in ("q{}_rad", "tau{}_Nm") for j in (1, 2))]
         table = np.column_stack([t, q, torque])
@@ -129,8 +133,10 @@ def trajectories() -> None:
 
 def images() -> None:
     """Corners of a board, seen by a camera on the flange."""
-    cell = make_cell(np.random.default_rng(2), points=board_points((4, 3), 0.06), poses=14)
-    write_cell(cell, Path())
+    cell = simulate_pixel_cell(
+        np.random.default_rng(2), target_points=board_corner_points((4, 3), 0.06), pose_count=14
+    )
+    write_cell_files(cell, Path())
 
 
 def sweeps(robot: mc.Robot) -> None:

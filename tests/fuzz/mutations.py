@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from minimax_cal.robots.robot import FREE
+from minimax_cal.robots.robot import NOTE_KEY_PREFIXES
 
 MOST = 10**300  # a longer integer is no float
 Rng = np.random.Generator
@@ -205,7 +205,7 @@ def misspelt(raw: bytes, rng: Rng) -> tuple[bytes, str]:
     """JSON with one key of one object misspelt, and which; a key of a note's own is not spoilt."""
     tree = json.loads(raw)
     found = [(part, key) for part, key in places(tree) if isinstance(part, dict)]
-    found = [(part, key) for part, key in found if not str(key).startswith(FREE)]
+    found = [(part, key) for part, key in found if not str(key).startswith(NOTE_KEY_PREFIXES)]
     part, key = found[int(rng.integers(len(found)))]
     at = int(rng.integers(len(key)))
     slip = str(pick(rng, (key + "s", key[:at] + "q" + key[at:], key.upper())))

@@ -24,7 +24,7 @@ from typing import Any
 
 import minimax_cal as mc
 from minimax_cal.cli import main
-from minimax_cal.ground.errors import CalibrationError
+from minimax_cal.core.errors import CalibrationError
 
 from .cases import Case, case
 from .known import disagreement

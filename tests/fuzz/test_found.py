@@ -14,13 +14,13 @@ from conftest import run
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.ground.files import json_of
+from minimax_cal.core.files import parse_json
 from minimax_cal.instruments import read_relative
-from minimax_cal.instruments.pixels import read_board
-from minimax_cal.measuring.checks import check_joints
+from minimax_cal.instruments.pixel_data import read_board_targets
+from minimax_cal.measuring.measurement_checks import check_and_complete_joints
 from minimax_cal.modelling.simulate import simulate
-from minimax_cal.reporting.plots.figures import new_figure, save
-from minimax_cal.robots.ranges import near_zero
+from minimax_cal.reporting.plots.error_figure import new_figure, write_figure
+from minimax_cal.robots.joint_ranges import clip_range_near_zero
 from qp_backends import Problem, child
 from qp_backends.problem import COLD
 
@@ -168,9 +168,12 @@ def test_the_name_of_an_output_moves_no_cursor(tmp_path, monkeypatch, capsys):
 
 def test_targets_on_a_terminal_move_no_cursor():
     """In a pipe they are the file as it is; `compensate` without -o prints them."""
-    from minimax_cal.cli.compensate import on_terminal
+    from minimax_cal.cli.compensate import replace_control_characters_in_lines
 
-    assert on_terminal("q1_rad,\x1b[31m\n1,2\n") == "q1_rad,\N{REPLACEMENT CHARACTER}[31m\n1,2\n"
+    assert (
+        replace_control_characters_in_lines("q1_rad,\x1b[31m\n1,2\n")
+        == "q1_rad,\N{REPLACEMENT CHARACTER}[31m\n1,2\n"
+    )
 
 
 def test_a_picture_without_room_is_drawn_without_a_warning(tmp_path):
@@ -179,7 +182,7 @@ def test_a_picture_without_room_is_drawn_without_a_warning(tmp_path):
     axes.set_ylabel("long" * 40)
     axes.set_xlabel("long" * 40)
     axes.set_title("t\n" * 40)
-    save(figure, tmp_path / "a.png")
+    write_figure(figure, tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 0
 
 
@@ -192,11 +195,11 @@ def test_numbers_that_no_result_has_are_refused(tmp_path, capsys):
 
         path = broken(tmp_path, "diagnosis.json", huge)
         assert "cannot be; at most 1e+100" in refused(capsys, "report", path)
-    assert json_of("[1e99, -3, 0, 2.5e-320, true]") == [1e99, -3, 0, 2.5e-320, True]
-    assert [type(value) for value in json_of("[1, 1.0, -0]")] == [int, float, int]
+    assert parse_json("[1e99, -3, 0, 2.5e-320, true]") == [1e99, -3, 0, 2.5e-320, True]
+    assert [type(value) for value in parse_json("[1, 1.0, -0]")] == [int, float, int]
     for text in ("1e400", "-" + "9" * 5000):
         with pytest.raises(ValueError, match="at most"):
-            json_of(text)
+            parse_json(text)
 
 
 def test_two_outputs_are_two_files(tmp_path, monkeypatch, capsys):
@@ -250,9 +253,9 @@ def test_a_fit_without_targets_is_told_in_our_words(tmp_path, capsys):
 
 
 def test_fifty_notices_are_enough(capsys):
-    from minimax_cal.cli.options import Output
+    from minimax_cal.cli.options import CommandOutput
 
-    Output(None, False, None, False).notice(*map(str, range(20_000)))
+    CommandOutput(None, False, None, False).print_notices(*map(str, range(20_000)))
     lines = capsys.readouterr().err.splitlines()
     assert lines[0] == "notice: 0"
     assert lines[50:] == ["notice: and 19950 more, in the JSON"]
@@ -297,23 +300,23 @@ def test_what_is_no_scheduler_is_told_in_our_words(tmp_path, capsys, monkeypatch
 def test_a_joint_that_never_comes_to_zero_is_no_trouble():
     """Limits of 3.5 to 7 rad, or of 1 to 3 m, left nothing to draw from."""
     for lower, upper in ((3.5, 7.0), (-20.0, -15.0), (4.0, np.inf), (-np.inf, -4.0), (-1.0, 9.0)):
-        low, high = near_zero(np.array([lower]), np.array([upper]))
+        low, high = clip_range_near_zero(np.array([lower]), np.array([upper]))
         assert lower <= low[0] < high[0] <= upper
         assert high[0] - low[0] <= 2.0 * np.pi + 1e-12
     for lower, upper in ((-5.0, 1.0), (-1.0, 5.0), (-7.0, 7.0), (-np.inf, np.inf)):  # as ever
-        ends = near_zero(np.array([lower]), np.array([upper]))
+        ends = clip_range_near_zero(np.array([lower]), np.array([upper]))
         assert ends == (max(lower, -np.pi), min(upper, np.pi))
-    low, high = near_zero(np.array([1.0]), np.array([3.0]), np.array([0.5]))
+    low, high = clip_range_near_zero(np.array([1.0]), np.array([3.0]), np.array([0.5]))
     assert_allclose([low[0], high[0]], [1.0, 2.0])
 
 
 def test_a_simulator_keeps_no_log_beside_the_results(tmp_path, monkeypatch):
     """MuJoCo wrote its warnings to a file in the folder where it was called."""
     pytest.importorskip("mujoco", reason="needs pip install minimax-cal[mujoco]")
-    from minimax_cal.robots.mjcf import mujoco
+    from minimax_cal.robots.mjcf_import import import_mujoco
 
     monkeypatch.chdir(tmp_path)
-    found = mujoco()
+    found = import_mujoco()
     model = '<mujoco><worldbody><body><freejoint/><geom size="1"/></body></worldbody></mujoco>'
     data = found.MjData(found.MjModel.from_xml_string(model))
     data.qvel[:] = np.nan
@@ -326,13 +329,13 @@ def test_a_simulator_keeps_no_log_beside_the_results(tmp_path, monkeypatch):
 def test_xml_in_another_encoding_than_it_says_is_refused(code, tmp_path):
     """One of the two parsers that read a model did not mind."""
     pytest.importorskip("mujoco", reason="needs pip install minimax-cal[mujoco]")
-    from minimax_cal.robots.document import read_document
+    from minimax_cal.robots.xml_document import read_xml_with_includes
 
     path = tmp_path / "arm.xml"
     other = "utf-8" if code == "utf-16" else "utf-16"
     path.write_bytes(f'<?xml version="1.0" encoding="{other}"?><mujoco/>'.encode(code))
     with pytest.raises(mc.CalibrationError, match=r"arm\.xml"):
-        read_document(path)
+        read_xml_with_includes(path)
 
 
 def test_import_writes_nothing_that_cannot_be_read(tmp_path, capsys):
@@ -360,11 +363,11 @@ def test_a_joint_limit_beyond_all_numbers_is_no_warning():
     """Twice 1e308 overflowed."""
     robot = mc.load_robot("irb120")
     upper = np.where(np.arange(6) == 0, 1e308, robot.upper)
-    check_joints(replace(robot, upper=upper), simulate(robot, poses=9).data)
+    check_and_complete_joints(replace(robot, upper=upper), simulate(robot, poses=9).data)
 
 
 def test_a_board_larger_than_a_hall_is_refused(tmp_path):
     path = tmp_path / "board.csv"
     path.write_text("target,x_mm,y_mm,z_mm\na,0,0,0\nb,1e300,0,0\nc,0,40,0\n")
     with pytest.raises(mc.DataError, match=r"board\.csv:3: target 'b' is more than 100 m"):
-        read_board(path)
+        read_board_targets(path)

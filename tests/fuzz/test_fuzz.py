@@ -20,8 +20,8 @@ from hypothesis import strategies as st
 
 import minimax_cal as mc
 from minimax_cal.cli import main
-from minimax_cal.cli.running import cli
-from minimax_cal.ground.errors import CalibrationError
+from minimax_cal.cli.command_runner import cli
+from minimax_cal.core.errors import CalibrationError
 from minimax_cal.robots.robot import robot_from_dict
 
 from .__main__ import table_of

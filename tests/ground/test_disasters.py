@@ -12,12 +12,12 @@ import pytest
 ONE, OTHER = "a" * 4_000_000, "b" * 3_000_000
 WRITER = """
 import sys
-from minimax_cal.ground.files import write_whole
+from minimax_cal.core.files import write_file_atomically
 path, letter, count = sys.argv[1:]
 text = letter * {"a": 4_000_000, "b": 3_000_000}[letter]
 print("ready", flush=True)
 for _ in range(int(count)):
-    write_whole(path, text)
+    write_file_atomically(path, text)
 """
 FULL = """
 import resource, sys

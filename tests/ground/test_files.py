@@ -8,14 +8,14 @@ from typing import Any
 
 import pytest
 
-from minimax_cal.ground.errors import CalibrationError, DataError
-from minimax_cal.ground.files import check_writable, read_raw, read_text, write_whole
+from minimax_cal.core.errors import CalibrationError, DataError
+from minimax_cal.core.files import check_writable, read_bytes, read_text, write_file_atomically
 
 
 def test_links_in_a_circle_are_said(tmp_path):
     loop = tmp_path / "loop"
     loop.symlink_to(loop)
-    for write in (check_writable, lambda path: write_whole(path, "text")):
+    for write in (check_writable, lambda path: write_file_atomically(path, "text")):
         with pytest.raises(CalibrationError, match="its links lead nowhere"):
             write(loop)
 
@@ -24,7 +24,7 @@ def test_a_file_keeps_its_permissions(tmp_path):
     path = tmp_path / "result.json"
     path.write_text("")
     path.chmod(0o600)
-    write_whole(path, "text")
+    write_file_atomically(path, "text")
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
     assert path.read_text() == "text"
 
@@ -32,7 +32,7 @@ def test_a_file_keeps_its_permissions(tmp_path):
 @pytest.mark.skipif(not Path("/dev/zero").exists(), reason="there is no /dev/zero to read")
 def test_what_never_ends_is_refused():
     with pytest.raises(DataError, match="is larger than 1 MiB"):
-        read_raw("/dev/zero", kind=DataError, most=1 << 20)
+        read_bytes("/dev/zero", error_type=DataError, max_bytes=1 << 20)
 
 
 def test_lines_end_alike(tmp_path):
@@ -43,10 +43,10 @@ def test_lines_end_alike(tmp_path):
 
 
 def test_a_name_may_be_long_and_not_longer(tmp_path):
-    write_whole(tmp_path / ("n" * 255), "text")
+    write_file_atomically(tmp_path / ("n" * 255), "text")
     assert os.listdir(tmp_path) == ["n" * 255]
     check_writable(tmp_path / ("n" * 254))
-    for write in (check_writable, lambda path: write_whole(path, "text")):
+    for write in (check_writable, lambda path: write_file_atomically(path, "text")):
         with pytest.raises(CalibrationError, match="its name is too long"):
             write(tmp_path / ("n" * 300))
     assert os.listdir(tmp_path) == ["n" * 255]
@@ -75,11 +75,11 @@ def test_file_and_folder_are_on_the_disk(tmp_path, monkeypatch):
     """A name must not reach the disk before its content, nor the caller hear "done" before both."""
     heard = listen(monkeypatch)
     monkeypatch.delenv("MINIMAX_CAL_NO_FSYNC", raising=False)
-    write_whole(tmp_path / "fit.json", "text")
+    write_file_atomically(tmp_path / "fit.json", "text")
     assert heard == ["file", "name", "folder"]
     heard.clear()
     monkeypatch.setenv("MINIMAX_CAL_NO_FSYNC", "1")
-    write_whole(tmp_path / "fit.json", "text")
+    write_file_atomically(tmp_path / "fit.json", "text")
     assert heard == ["name"]
 
 
@@ -96,8 +96,8 @@ def test_a_disk_that_fails_is_said(tmp_path, monkeypatch, number, is_refused):
     monkeypatch.setattr(os, "fsync", fsync)
     if is_refused:
         with pytest.raises(CalibrationError, match="cannot be written"):
-            write_whole(path, "new")
+            write_file_atomically(path, "new")
     else:
-        write_whole(path, "new")
+        write_file_atomically(path, "new")
     assert path.read_text() == ("old" if is_refused else "new")
     assert os.listdir(tmp_path) == ["fit.json"]

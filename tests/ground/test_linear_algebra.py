@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from minimax_cal.ground.linear_algebra import (
+from minimax_cal.core.linear_algebra import (
     column_scales,
     jackknife_variance,
     project_out,

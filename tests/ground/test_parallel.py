@@ -7,16 +7,16 @@ from typing import ClassVar
 
 import pytest
 
-from experiments.sweep import in_parallel
-from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.parallel import (
-    START,
-    Clock,
-    WorkersLost,
-    chunked,
+from experiments.sweep import run_calls_in_parallel
+from minimax_cal.core.errors import OptionError
+from minimax_cal.core.parallel import (
+    PROCESS_START_SECONDS,
+    CallTimer,
+    WorkersLostError,
     deque,
-    fetched,
-    share,
+    fetch_result,
+    pop_chunks,
+    run_in_parallel,
 )
 
 pytest.importorskip("joblib", reason="several processes need pip install minimax-cal[experiments]")
@@ -51,8 +51,10 @@ def died(parent: int) -> None:
 
 @pytest.mark.parametrize("processes", [1, 2, 3])
 def test_every_call_is_made_once(processes):
-    count = int(1.5 * START / LONG)
-    found = list(share(squared, [(n, LONG) for n in range(count)], processes=processes))
+    count = int(1.5 * PROCESS_START_SECONDS / LONG)
+    found = list(
+        run_in_parallel(squared, [(n, LONG) for n in range(count)], process_count=processes)
+    )
     assert sorted((number, each[0]) for number, each in found) == [(n, n**2) for n in range(count)]
     pids = {pid for _, (_, pid) in found}
     assert os.getpid() in pids  # this one works, too
@@ -61,23 +63,23 @@ def test_every_call_is_made_once(processes):
 
 def test_both_ways_work_in_one_process():
     """The pool of the first is none of joblib's, which would lack what joblib gives its own."""
-    brief = int(1.5 * START / LONG)
+    brief = int(1.5 * PROCESS_START_SECONDS / LONG)
     for _ in range(2):
-        found = list(share(squared, [(n, LONG) for n in range(brief)], processes=2))
+        found = list(run_in_parallel(squared, [(n, LONG) for n in range(brief)], process_count=2))
         assert len({pid for _, (_, pid) in found}) == 2
-        whole = dict(in_parallel(squared, [(n,) for n in range(4)], processes=2))
+        whole = dict(run_calls_in_parallel(squared, [(n,) for n in range(4)], processes=2))
         assert [whole[n][0] for n in range(4)] == [0, 1, 4, 9]
 
 
 def test_brief_work_starts_no_process(monkeypatch):
-    monkeypatch.setattr(Clock, "seconds", 1e-5)  # however busy the machine is
-    found = dict(share(squared, [(n,) for n in range(300)], processes=2))
+    monkeypatch.setattr(CallTimer, "mean_seconds", 1e-5)  # however busy the machine is
+    found = dict(run_in_parallel(squared, [(n,) for n in range(300)], process_count=2))
     assert {pid for _, pid in found.values()} == {os.getpid()}
 
 
 def test_chunks_shrink_towards_the_end():
     waiting = deque((squared, n, (n,)) for n in range(100))
-    sizes = [len(chunk) for chunk in chunked(waiting, 0.05, 4)]
+    sizes = [len(chunk) for chunk in pop_chunks(waiting, 0.05, 4)]
     assert sum(sizes) == 100
     assert sizes[0] == 20  # a second
     assert sizes == sorted(sizes, reverse=True)
@@ -85,14 +87,14 @@ def test_chunks_shrink_towards_the_end():
 
 
 def test_a_process_that_dies_is_said():
-    calls = [(os.getpid(),)] * int(3.0 * START / LONG)
-    with pytest.raises(WorkersLost, match="a process died"):
-        list(share(died, calls, processes=2))
+    calls = [(os.getpid(),)] * int(3.0 * PROCESS_START_SECONDS / LONG)
+    with pytest.raises(WorkersLostError, match="a process died"):
+        list(run_in_parallel(died, calls, process_count=2))
 
 
 def test_no_processes_are_refused():
     with pytest.raises(OptionError, match="0 processes"):
-        list(share(squared, [(1,)], processes=0))
+        list(run_in_parallel(squared, [(1,)], process_count=0))
 
 
 class Future:
@@ -108,15 +110,17 @@ class Future:
 
 
 def test_a_result_that_is_lost_is_waited_for_again():
-    assert fetched(Future("finished", (3, "x")), TimeoutError) == [(3, "x")]
-    assert fetched(Future("finished", TimeoutError()), TimeoutError) == []
+    assert fetch_result(Future("finished", (3, "x")), TimeoutError) == [(3, "x")]
+    assert fetch_result(Future("finished", TimeoutError()), TimeoutError) == []
     with pytest.raises(TimeoutError):  # the call's own
-        fetched(Future("error", TimeoutError()), TimeoutError)
+        fetch_result(Future("error", TimeoutError()), TimeoutError)
 
 
 def test_calls_are_packed_where_others_are_made():
     """In another thread they might change meanwhile, by what a call made here keeps for later."""
-    calls = [(Noted(), LONG)] * int(4 * START / LONG)
-    found = {number: result for number, (result, _) in share(squared, calls, processes=2)}
+    calls = [(Noted(), LONG)] * int(4 * PROCESS_START_SECONDS / LONG)
+    found = {
+        number: result for number, (result, _) in run_in_parallel(squared, calls, process_count=2)
+    }
     assert set(found.values()) == {9}
     assert Noted.threads == {threading.get_ident()}

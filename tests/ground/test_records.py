@@ -13,10 +13,17 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.facts import APART, Fact, Later, Mm, derived, facts_in_words
-from minimax_cal.ground.files import json_text, plain
-from minimax_cal.ground.records import read, record_schema
+from minimax_cal.core.arrays import Array
+from minimax_cal.core.files import format_json, to_plain_json
+from minimax_cal.core.record_fields import (
+    SEPARATE_FIELD_FORMAT,
+    FieldFormat,
+    LazyValue,
+    LengthInMillimetres,
+    derived_field,
+    format_record_fields,
+)
+from minimax_cal.core.record_parsing import build_record_schema, parse_record
 
 jsonschema = pytest.importorskip("jsonschema", reason="jsonschema is not installed")
 
@@ -44,22 +51,22 @@ class Wire:
     """A record with units, arrays and records of its own."""
 
     name: str
-    length: Mm
-    ends: Annotated[Ends, Fact(key="where.ends_mm", scale=1e3)]
+    length: LengthInMillimetres
+    ends: Annotated[Ends, FieldFormat(key="where.ends_mm", scale=1e3)]
     error: Array
     interval: tuple[float, float]
     kind: Kind
     side: Literal["left", "right"]
-    colour: Annotated[str, Fact(among=("red", "blue"))]
-    count: Annotated[int, Fact(least=0)]
-    knots: Annotated[tuple[Knot, ...], Fact(fewest=1)]
+    colour: Annotated[str, FieldFormat(among=("red", "blue"))]
+    count: Annotated[int, FieldFormat(least=0)]
+    knots: Annotated[tuple[Knot, ...], FieldFormat(fewest=1)]
     loads: Mapping[str, tuple[float, float]]
-    hidden: Annotated[Knot | None, APART] = None
+    hidden: Annotated[Knot | None, SEPARATE_FIELD_FORMAT] = None
     used: bool | None = None
-    note: Annotated[str, Fact(brief=True)] = ""
-    tension: Later[float] = field(default_factory=lambda: Later(lambda: 7.0))
+    note: Annotated[str, FieldFormat(brief=True)] = ""
+    tension: LazyValue[float] = field(default_factory=lambda: LazyValue(lambda: 7.0))
 
-    @derived("{:.1f} mm on average", key="where.mean_mm", scale=1e3)
+    @derived_field("{:.1f} mm on average", key="where.mean_mm", scale=1e3)
     def mean(self) -> float:
         """Of the errors [m]."""
         return float(self.error.mean())
@@ -97,27 +104,27 @@ FILE = {
 
 
 def test_a_record_is_written_by_its_keys_and_units():
-    assert json.loads(json_text(plain(WIRE))) == FILE
+    assert json.loads(format_json(to_plain_json(WIRE))) == FILE
 
 
 def test_a_record_comes_back_bit_by_bit():
-    found = read(Wire, FILE | {"later": "unknown to this version"})
-    assert plain(found) == FILE
+    found = parse_record(Wire, FILE | {"later": "unknown to this version"})
+    assert to_plain_json(found) == FILE
     assert (found.length, found.kind, found.hidden) == (1.25, Kind.THIN, None)
     assert math.isnan(found.ends.last)
     assert_array_equal(found.error, WIRE.error)
-    assert facts_in_words(found) == "2.0 mm on average"
+    assert format_record_fields(found) == "2.0 mm on average"
 
 
 def test_what_may_miss_is_filled_in():
     content: dict[str, Any] = {k: v for k, v in FILE.items() if k not in ("used", "tension")}
     content["knots"] = [{"at": 1}]
-    found = read(Wire, content)
+    found = parse_record(Wire, content)
     assert (found.used, found.tension.value, found.knots) == (None, 7.0, (Knot(1.0),))
 
 
 def test_the_schema_is_of_the_file():
-    made = record_schema(Wire)
+    made = build_record_schema(Wire)
     jsonschema.Draft202012Validator.check_schema(made)
     assert not list(jsonschema.Draft202012Validator(made).iter_errors(FILE))
     assert {"length_mm", "where", "error"} <= set(made["required"])
@@ -150,6 +157,6 @@ def test_the_schema_is_of_the_file():
 )
 def test_what_is_wrong_is_named_with_its_place(change, says):
     with pytest.raises(ValueError, match=f"^{says}"):
-        read(Wire, FILE | change)
-    errors = jsonschema.Draft202012Validator(record_schema(Wire)).iter_errors(FILE | change)
+        parse_record(Wire, FILE | change)
+    errors = jsonschema.Draft202012Validator(build_record_schema(Wire)).iter_errors(FILE | change)
     assert list(errors) or "e.101" in says or "rows" in says or "than numbers" in says

@@ -3,9 +3,9 @@ from xml.etree import ElementTree
 
 import pytest
 
-from minimax_cal.ground.errors import CalibrationError
-from minimax_cal.ground.files import json_text, write_whole
-from minimax_cal.ground.tables import Table, show
+from minimax_cal.core.errors import CalibrationError
+from minimax_cal.core.files import format_json, write_file_atomically
+from minimax_cal.core.tables import Table, format_cell
 
 TABLE = Table(
     "errors & more",
@@ -17,9 +17,11 @@ TABLE = Table(
 
 def test_a_table_of_records():
     records = [("a", {"x": 1.5, "seen": True}), ("b", {"x": None, "seen": False})]
-    made = Table.of("t", records, "0=name | 1.x=size of |x| mm .2f | 1.seen=", "1.x=a | b=c .1f")
+    made = Table.from_records(
+        "t", records, "0=name | 1.x=size of |x| mm .2f | 1.seen=", "1.x=a | b=c .1f"
+    )
     assert made.header == ("name", "size of |x| mm", "", "a | b=c")
-    assert made.plus(("c", 2, "", 2)).cells() == [
+    assert made.with_rows(("c", 2, "", 2)).formatted_cells() == [
         ["a", "1.50", "yes", "1.5"], ["b", "-", "", "-"], ["c", "2.00", "", "2.0"]
     ]  # fmt: skip
 
@@ -38,7 +40,7 @@ def test_one_number_reads_the_same_everywhere():
      (-12, "d", "-12"), (-0.01, ".2f", "-0.01")],
 )  # fmt: skip
 def test_nothing_has_no_sign(value, spec, text):
-    assert show(value, spec) == text
+    assert format_cell(value, spec) == text
 
 
 def test_cells_are_literal_text():
@@ -61,20 +63,20 @@ def test_html_is_a_table_with_headers():
 
 def test_files_are_whole_or_absent(tmp_path, monkeypatch):
     path = tmp_path / "a.json"
-    write_whole(path, "first")
+    write_file_atomically(path, "first")
     monkeypatch.setattr("os.replace", lambda *a: (_ for _ in ()).throw(OSError(28, "disk full")))
     with pytest.raises(CalibrationError, match="disk full"):
-        write_whole(path, "second")
+        write_file_atomically(path, "second")
     assert path.read_text() == "first"
     assert list(tmp_path.iterdir()) == [path]  # no scrap left
     monkeypatch.undo()
     link = tmp_path / "link.json"
     link.symlink_to(path)
-    write_whole(link, "third")
+    write_file_atomically(link, "third")
     assert link.is_symlink()
     assert path.read_text() == "third"
     with pytest.raises(ValueError, match="JSON"):
-        json_text({"x": math.nan})
+        format_json({"x": math.nan})
 
 
 def test_a_pipe_is_written_into_not_replaced(tmp_path):
@@ -87,7 +89,7 @@ def test_a_pipe_is_written_into_not_replaced(tmp_path):
     received: list[str] = []
     reader = threading.Thread(target=lambda: received.append(pipe.read_text()))
     reader.start()
-    write_whole(pipe, "through")
+    write_file_atomically(pipe, "through")
     reader.join(timeout=10)
     assert received == ["through"]
     assert stat.S_ISFIFO(pipe.stat().st_mode)

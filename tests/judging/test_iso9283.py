@@ -12,25 +12,25 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi
 
 import minimax_cal as mc
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import DataError, OptionError
-from minimax_cal.judging.iso9283 import Iso9283, iso9283
-from minimax_cal.judging.iso9283.formulas import (
-    direction_variation,
-    distance_errors,
+from minimax_cal.core.arrays import Array
+from minimax_cal.core.errors import DataError, OptionError
+from minimax_cal.measuring.measurements import Measurements, measurements
+from minimax_cal.measuring.visit_history import add_history_columns
+from minimax_cal.robots.joint_sampling import random_joint_values_above_floor
+from minimax_cal.validation.iso9283 import Iso9283, compute_iso9283
+from minimax_cal.validation.iso9283.formulas import (
+    distance_accuracy,
+    distance_accuracy_and_repeatability,
     euler_angles,
     euler_deviation,
-    mean_turn,
+    fit_rotations,
+    mean_rotations,
+    multidirectional_variation,
     orientation_error,
-    repeatability,
-    repeated_distances,
-    turns_of,
+    position_repeatability,
 )
-from minimax_cal.judging.iso9283.result import CYCLES
-from minimax_cal.judging.iso9283.visits import stops_of
-from minimax_cal.measuring.history import with_history
-from minimax_cal.measuring.measurements import Measurements, measurements
-from minimax_cal.robots.sampling import random_poses
+from minimax_cal.validation.iso9283.result import STANDARD_CYCLE_COUNT
+from minimax_cal.validation.iso9283.visits import build_stops
 
 TRIANGLE = np.array([[0.1, 0.0, 0.03], [-0.05, 0.09, 0.03], [-0.05, -0.09, 0.03]])
 EXACT = dict(rtol=0, atol=1e-12)
@@ -46,7 +46,7 @@ def cell(robot: mc.Robot) -> mc.Cell:
 
 def level_poses(robot: mc.Robot, count: int, seed: int = 3) -> Array:
     """Joints whose flange is far from gimbal lock."""
-    q = random_poses(robot, 4 * count, np.random.default_rng(seed))
+    q = random_joint_values_above_floor(robot, 4 * count, np.random.default_rng(seed))
     b = euler_angles(robot.pose(q)[:, :3, :3])[:, 1]
     return q[np.cos(b) > 0.3][:count]
 
@@ -59,7 +59,7 @@ def seen_at(cell: mc.Cell, q: Array, **columns: Array) -> Measurements:
 def of(cell: mc.Cell, data: Measurements, **choice: object) -> Iso9283:
     """All poses as training poses of one cell."""
     held = np.zeros(data.poses, dtype=bool)
-    return iso9283({"after": cell}, data, held, **choice)
+    return compute_iso9283({"after": cell}, data, held, **choice)
 
 
 def turned(cell: mc.Cell, y: Array, shift: Array, turn: Array) -> Array:
@@ -81,7 +81,7 @@ def test_repeatability_by_hand():
     line = np.array([[0, 0, 0], [0, 0, 0], [3, 0, 0]])
     points = np.concatenate([square, pair, line, [[7, 7, 7]], [[np.nan] * 3]])
     pose = np.repeat([0, 1, 2, 3, 3], [4, 2, 3, 1, 1])
-    found = repeatability(points, pose, 5)
+    found = position_repeatability(points, pose, 5)
     assert_allclose(found[:3], [2.0, 3.0, 4.0 / 3.0 + 3.0 / np.sqrt(3.0)], **EXACT)
     assert np.isnan(found[3:]).all()  # one visit that was measured, and none
 
@@ -89,7 +89,7 @@ def test_repeatability_by_hand():
 def test_repeatability_of_known_scatter():
     # l is sigma times a chi variable of three degrees of freedom, about the barycentre of n
     n, sigma, rng = 4000, 2e-5, np.random.default_rng(1)
-    found = repeatability(sigma * rng.normal(size=(n, 3)), np.zeros(n, dtype=int), 1)[0]
+    found = position_repeatability(sigma * rng.normal(size=(n, 3)), np.zeros(n, dtype=int), 1)[0]
     mean, sd = chi.mean(3), chi.std(3)
     kurtosis = 3.0 + float(chi.stats(3, moments="k"))
     error = sigma * (sd / np.sqrt(n) + 3.0 * sd * np.sqrt((kurtosis - 1.0) / (4.0 * n)))
@@ -100,14 +100,14 @@ def test_direction_variation_by_hand():
     points = np.array([[0, 0, 0], [2, 0, 0], [0, 3, 0], [2, 3, 0], [1, 1, 2.0], [50, 0, 0]])
     way = np.array([4, 4, 7, 7, 9, -1])  # barycentres (1,0,0), (1,3,0), (1,1,2); one unknown
     pose = np.zeros(6, dtype=int)
-    assert_allclose(direction_variation(points, pose, way, 2), [3.0, np.nan])
-    assert np.isnan(direction_variation(points, pose, np.full(6, -1), 1)).all()
+    assert_allclose(multidirectional_variation(points, pose, way, 2), [3.0, np.nan])
+    assert np.isnan(multidirectional_variation(points, pose, np.full(6, -1), 1)).all()
 
 
 def test_rigid_fit_is_that_of_scipy(rng):
     points = rng.normal(size=(40, 3, 3))
     points[7, 1] = np.nan
-    found = turns_of(TRIANGLE, points)
+    found = fit_rotations(TRIANGLE, points)
     assert np.isnan(found[7]).all()
     own = TRIANGLE - TRIANGLE.mean(axis=0)
     for j in np.delete(np.arange(40), 7):
@@ -117,7 +117,7 @@ def test_rigid_fit_is_that_of_scipy(rng):
 
 @pytest.mark.parametrize("flat", [TRIANGLE[:2], np.outer([0.0, 1.0, 2.0], [1.0, 2.0, 0.5])])
 def test_two_targets_or_a_line_show_no_orientation(flat, rng):
-    assert np.isnan(turns_of(flat, rng.normal(size=(5, len(flat), 3)))).all()
+    assert np.isnan(fit_rotations(flat, rng.normal(size=(5, len(flat), 3)))).all()
 
 
 @settings(deadline=None, max_examples=60)
@@ -150,7 +150,7 @@ def test_euler_deviation_takes_the_short_way():
 
 def test_mean_turn_is_that_of_scipy(rng):
     turn = Rotation.from_rotvec(0.1 * rng.normal(size=(30, 3))) * Rotation.random(rng=rng)
-    found = mean_turn(turn.as_matrix(), np.zeros(30, dtype=int), 2)
+    found = mean_rotations(turn.as_matrix(), np.zeros(30, dtype=int), 2)
     assert_allclose(found[0], turn.mean().as_matrix(), rtol=0, atol=1e-12)
     assert np.isnan(found[1]).all()
 
@@ -162,7 +162,7 @@ def test_distance_errors_pair_by_pair(rng):
         for i in range(6)
         for j in range(i + 1, 6)
     ]
-    assert_allclose(distance_errors(real, told), every, **EXACT)
+    assert_allclose(distance_accuracy(real, told), every, **EXACT)
 
 
 def test_repeated_distances_by_hand():
@@ -171,7 +171,7 @@ def test_repeated_distances_by_hand():
     pose = np.array(["P", "Q", "P", "Q", "P", "Q", "P", "once"])
     attained = np.column_stack([x, 0 * x, 0 * x])
     commanded = np.column_stack([np.where(pose == "Q", 1.5, 0.0), 0 * x, 0 * x])
-    accuracy, scatter = repeated_distances(attained, commanded, pose)
+    accuracy, scatter = distance_accuracy_and_repeatability(attained, commanded, pose)
     assert_allclose(accuracy, [0.5], **EXACT)
     assert_allclose(scatter, [3.0], **EXACT)  # S of 1, 2, 3 is 1
 
@@ -238,7 +238,7 @@ def test_a_tcp_anywhere_on_the_flange(cell):
 
 def test_near_gimbal_lock_a_and_c_are_left_out(cell):
     """AO_b and AO' stay: a turn of 1 mrad is 1 mrad everywhere, while a and c run away."""
-    q = random_poses(cell.robot, 3000, np.random.default_rng(8))
+    q = random_joint_values_above_floor(cell.robot, 3000, np.random.default_rng(8))
     level = np.cos(euler_angles(cell.robot.pose(q)[:, :3, :3])[:, 1])
     q = np.concatenate([q[level < 0.08][:6], q[level > 0.5][:6]])
     data = seen_at(cell, q)
@@ -250,7 +250,7 @@ def test_near_gimbal_lock_a_and_c_are_left_out(cell):
     assert_allclose(values.angle, 1e-3, **EXACT)
     assert np.isfinite(values.euler[:, 1]).all()
     assert np.isnan(values.euler[:, ::2]).sum() == 12
-    both = turns_of(TRIANGLE, (data.y - cell.base[:3, 3]) @ cell.base[:3, :3])
+    both = fit_rotations(TRIANGLE, (data.y - cell.base[:3, 3]) @ cell.base[:3, :3])
     there = cell.robot.pose(q)[:, :3, :3]
     assert np.abs(euler_deviation(both, there)[:6, ::2]).max() > 5e-3  # what was left out
     assert "6 poses" in part.reasons["AO_a, AO_c"]
@@ -329,8 +329,8 @@ def test_what_was_not_moved_is_one_stop(cell):
     q = level_poses(cell.robot, 3)[[0, 0, 0, 1, 2, 0]]
     data = seen_at(cell, q)
     data = data.with_y(data.y + np.arange(6)[:, None, None] * 1e-5)
-    told = with_history(data.in_visit_order())
-    stops = stops_of(told, {"after": data.y}, np.zeros(6, dtype=bool))
+    told = add_history_columns(data.in_visit_order())
+    stops = build_stops(told, {"after": data.y}, np.zeros(6, dtype=bool))
     assert_array_equal(stops.pose, ["line 1", "line 4", "line 5", "line 1"])
     assert_allclose(stops.attained[0], data.y[:3].mean(axis=0), **EXACT)
     found = of(cell, data)
@@ -361,7 +361,7 @@ def test_one_reflector_at_one_nest_after_the_other(cell):
 def test_pairs_keep_to_their_part(cell):
     data = seen_at(cell, level_poses(cell.robot, 9))
     held = np.array([0, 0, 1, 1, 0, 1, 0, 0, 1], dtype=bool)
-    parts = iso9283({"after": cell}, data, held).parts
+    parts = compute_iso9283({"after": cell}, data, held).parts
     assert len(parts["holdout"].values["after"].pairs) == 6
     assert len(parts["train"].values["after"].pairs) == 10
     assert len(parts["holdout"].values["after"].moves) == 1  # rows 3 and 4
@@ -399,7 +399,7 @@ def test_json_holds_what_the_tables_say(cell):
     ):
         assert f"{number:.4f}" in text
     assert [pose["pose"] for pose in content["poses"]] == ["P1", "P2", "P3", "P4"]
-    assert f"{CYCLES} or more at 0 of 4 poses" in text
+    assert f"{STANDARD_CYCLE_COUNT} or more at 0 of 4 poses" in text
     rows = found.pose_table().rows
     assert [row[0] for row in rows] == ["P1", "P2", "P3", "P4"]
 
@@ -437,8 +437,8 @@ def test_wrong_targets_and_joints_are_refused(cell):
 
 
 def test_many_poses_form_pairs_of_some(cell, monkeypatch):
-    monkeypatch.setattr("minimax_cal.judging.iso9283.visits.MAX_PAIRED_POSES", 10)
-    monkeypatch.setattr("minimax_cal.judging.iso9283.result.MAX_PAIRED_POSES", 10)
+    monkeypatch.setattr("minimax_cal.validation.iso9283.visits.MAX_PAIRED_POSES", 10)
+    monkeypatch.setattr("minimax_cal.validation.iso9283.result.MAX_PAIRED_POSES", 10)
     found = of(cell, seen_at(cell, level_poses(cell.robot, 30)))
     assert len(found.parts["train"].values["after"].pairs) == 45
     assert any("pairs of 10 of 30" in notice for notice in found.notices)

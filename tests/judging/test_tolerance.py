@@ -9,46 +9,48 @@ import pytest
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.fitting.beyond import Beyond, Fold
-from minimax_cal.fitting.options import silent
-from minimax_cal.fitting.solve import fit_cell
+from minimax_cal.fitting.cell_fit import fit_cell
+from minimax_cal.fitting.options import silent_progress
+from minimax_cal.fitting.region_holdout import RegionError, RegionHoldout
 from minimax_cal.fitting.uncertainty import Estimator
-from minimax_cal.judging.bootstrap import (
+from minimax_cal.measuring.pose_groups import group_repeated_poses
+from minimax_cal.modelling.cell import Cell
+from minimax_cal.modelling.parameters import ParameterValues
+from minimax_cal.modelling.point_model import PointLeastSquares, with_pose_errors
+from minimax_cal.modelling.simulate import Truth, simulate
+from minimax_cal.solvers import least_squares
+from minimax_cal.validation.bootstrap import (
     Bootstrap,
-    Draws,
-    between,
+    PoseDraws,
     bootstrap,
-    determined,
-    draw,
-    solved_again,
-    stepped,
+    draw_poses,
+    is_draw_determined,
+    parameter_step,
+    refit_by_gauss_newton_steps,
+    refit_minimax_replicates,
 )
-from minimax_cal.judging.tolerance import (
-    MIN_POSES,
+from minimax_cal.validation.tolerance import (
+    MIN_POSES_FOR_MAXIMUM,
     NOT_PASSED,
     NOT_STATED,
     PASSED,
-    Bound,
-    Claim,
-    Limit,
-    beyond,
-    elsewhere,
-    judge,
-    limits_of,
-    overall,
+    AccuracyClaim,
+    ErrorBound,
+    ToleranceLimit,
+    build_outside_claim,
+    describe_other_claim,
+    judge_limit_by_claim,
+    overall_verdict,
+    parse_limits,
 )
-from minimax_cal.measuring.grouping import groups
-from minimax_cal.modelling.cell import Cell
-from minimax_cal.modelling.model import SumOfSquares, with_poses
-from minimax_cal.modelling.parameters import State
-from minimax_cal.modelling.simulate import Truth, simulate
-from minimax_cal.solvers import least_squares
 
 # ---- tolerance -----------------------------------------------------------------------------------
 
 
-def claim(poses: int, value: float = 0.1, high: float = 0.15) -> Claim:
-    return Claim("inside", Bound(value, high), Bound(3 * value, 3 * high), poses, "some poses")
+def claim(poses: int, value: float = 0.1, high: float = 0.15) -> AccuracyClaim:
+    return AccuracyClaim(
+        "inside", ErrorBound(value, high), ErrorBound(3 * value, 3 * high), poses, "some poses"
+    )
 
 
 @pytest.mark.parametrize(
@@ -63,66 +65,86 @@ def claim(poses: int, value: float = 0.1, high: float = 0.15) -> Claim:
     ],
 )
 def test_rms(poses, value, high, limit, verdict):
-    assert judge(Limit("rms", limit), claim(poses, value, high)).verdict == verdict
+    assert (
+        judge_limit_by_claim(ToleranceLimit("rms", limit), claim(poses, value, high)).verdict
+        == verdict
+    )
 
 
 def test_a_maximum_needs_poses_and_says_how_many():
     """The next pose exceeds all n so far with probability 1/(n + 1): at most 5 % from 19 on."""
-    assert MIN_POSES == 19
-    few, enough = (judge(Limit("max", 1.0), claim(n)) for n in (18, 19))
+    assert MIN_POSES_FOR_MAXIMUM == 19
+    few, enough = (judge_limit_by_claim(ToleranceLimit("max", 1.0), claim(n)) for n in (18, 19))
     assert few.verdict == NOT_STATED
     assert "18 poses are too few for a maximum: at least 19 are needed" in few.why
     assert enough.verdict == PASSED
-    assert judge(Limit("max", 0.2), claim(5)).verdict == NOT_PASSED  # 0.3 was seen
+    assert (
+        judge_limit_by_claim(ToleranceLimit("max", 0.2), claim(5)).verdict == NOT_PASSED
+    )  # 0.3 was seen
 
 
 def test_all_together():
-    limits = Limit("rms", 1.0), Limit("rms", 0.01), Limit("max", 1.0)
-    good, bad, open_ = (judge(limit, claim(10)) for limit in limits)
-    assert overall((good,)) == PASSED
-    assert overall((good, open_)) == NOT_STATED
-    assert overall((good, open_, bad)) == NOT_PASSED
+    limits = ToleranceLimit("rms", 1.0), ToleranceLimit("rms", 0.01), ToleranceLimit("max", 1.0)
+    good, bad, open_ = (judge_limit_by_claim(limit, claim(10)) for limit in limits)
+    assert overall_verdict((good,)) == PASSED
+    assert overall_verdict((good, open_)) == NOT_STATED
+    assert overall_verdict((good, open_, bad)) == NOT_PASSED
 
 
 def test_beyond_is_of_the_worst_part():
-    folds = (Fold("one end", 20, 0.2, 0.9, 0.2), Fold("the other", 30, 0.4, 0.8, 0.4))
-    found = beyond(Beyond(folds, 0.3, 0.3, "", 0.5, 1.2))
-    assert (found.rms, found.largest) == (Bound(0.4, 0.5), Bound(0.9, 1.2))
+    folds = (RegionError("one end", 20, 0.2, 0.9, 0.2), RegionError("the other", 30, 0.4, 0.8, 0.4))
+    found = build_outside_claim(RegionHoldout(folds, 0.3, 0.3, "", 0.5, 1.2))
+    assert (found.rms, found.largest) == (ErrorBound(0.4, 0.5), ErrorBound(0.9, 1.2))
     assert "the other, 30 poses" in found.where
-    assert judge(Limit("rms", 0.45), found).verdict == NOT_PASSED
-    assert judge(Limit("rms", 0.55), found).verdict == PASSED
-    nothing = judge(Limit("rms", 1.0), beyond(Beyond(reason="no part can be spared")))
+    assert judge_limit_by_claim(ToleranceLimit("rms", 0.45), found).verdict == NOT_PASSED
+    assert judge_limit_by_claim(ToleranceLimit("rms", 0.55), found).verdict == PASSED
+    nothing = judge_limit_by_claim(
+        ToleranceLimit("rms", 1.0),
+        build_outside_claim(RegionHoldout(reason="no part can be spared")),
+    )
     assert (nothing.verdict, nothing.why) == (NOT_STATED, "no part can be spared")
 
 
 def test_nothing_is_passed_beyond_while_parts_could_not_be_judged():
-    folds = (Fold("one end", 20, 0.2, 0.9, 0.2),)
-    some = Beyond(folds, 0.2, 0.2, "", 0.3, 1.2, missed=("joint 2 at its low end",))
-    found = judge(Limit("rms", 0.5), beyond(some))
+    folds = (RegionError("one end", 20, 0.2, 0.9, 0.2),)
+    some = RegionHoldout(folds, 0.2, 0.2, "", 0.3, 1.2, missed=("joint 2 at its low end",))
+    found = judge_limit_by_claim(ToleranceLimit("rms", 0.5), build_outside_claim(some))
     assert found.verdict == NOT_STATED
     assert "only 1 of 2 parts could be judged, not joint 2 at its low end" in found.why
-    assert "1 of 2 parts could be judged" in beyond(some).where
-    assert judge(Limit("rms", 0.1), beyond(some)).verdict == NOT_PASSED  # seen is seen
+    assert "1 of 2 parts could be judged" in build_outside_claim(some).where
+    assert (
+        judge_limit_by_claim(ToleranceLimit("rms", 0.1), build_outside_claim(some)).verdict
+        == NOT_PASSED
+    )  # seen is seen
 
 
 def test_what_is_passed_does_not_hide_what_is_seen_beyond():
     inside = claim(30)
-    passed, failed = (judge(Limit("rms", size), inside) for size in (0.2, 0.12))
-    away = beyond(Beyond((Fold("one end", 20, 0.3, 0.9, 0.2),), 0.3, 0.3, "", 0.4, 1.2))
-    assert elsewhere(passed, away) == (
+    passed, failed = (
+        judge_limit_by_claim(ToleranceLimit("rms", size), inside) for size in (0.2, 0.12)
+    )
+    away = build_outside_claim(
+        RegionHoldout((RegionError("one end", 20, 0.3, 0.9, 0.2),), 0.3, 0.3, "", 0.4, 1.2)
+    )
+    assert describe_other_claim(passed, away) == (
         "RMS error passed inside the measured region alone: outside it is 0.300 mm, more than "
         "the 0.2 mm required"
     )
-    assert elsewhere(failed, away) == ""
-    assert elsewhere(judge(Limit("rms", 0.35), inside), away) == ""
-    assert elsewhere(passed, inside) == ""
-    assert elsewhere(passed, beyond(Beyond(reason="none"))) == ""
+    assert describe_other_claim(failed, away) == ""
+    assert (
+        describe_other_claim(judge_limit_by_claim(ToleranceLimit("rms", 0.35), inside), away) == ""
+    )
+    assert describe_other_claim(passed, inside) == ""
+    assert describe_other_claim(passed, build_outside_claim(RegionHoldout(reason="none"))) == ""
 
 
 def test_limits_are_read():
-    assert limits_of("rms 0.2, max 0.5") == (Limit("rms", 0.2), Limit("max", 0.5))
-    assert limits_of("MAX=1mm") == (Limit("max", 1.0),)
-    assert limits_of("") == ()
+    assert parse_limits("rms 0.2, max 0.5") == (
+        ToleranceLimit("rms", 0.2),
+        ToleranceLimit("max", 0.5),
+    )
+    assert parse_limits("MAX=1mm") == (ToleranceLimit("max", 1.0),)
+    assert parse_limits("") == ()
     for text in (
         "0.2",
         "rms",
@@ -134,9 +156,9 @@ def test_limits_are_read():
         "rms inf",
     ):
         with pytest.raises(mc.OptionError, match="write it in mm as rms"):
-            limits_of(text)
+            parse_limits(text)
     with pytest.raises(mc.OptionError, match="twice"):
-        limits_of("rms 0.2, rms 0.3")
+        parse_limits("rms 0.2, rms 0.3")
 
 
 def test_the_upper_limits_of_beyond_are_in_the_file(robot):
@@ -160,17 +182,17 @@ def found(fit: mc.Fit) -> Bootstrap:
 
 def inner(
     robot: mc.Robot, data: mc.Measurements, objective: str, **options: object
-) -> tuple[mc.Fit, Draws]:
+) -> tuple[mc.Fit, PoseDraws]:
     one = mc.calibrate(robot, data, objective, holdout=0.0, **options)
-    return one, draw(one.group, 4, np.random.default_rng(7))
+    return one, draw_poses(one.group, 4, np.random.default_rng(7))
 
 
-def refitted(estimator: Estimator, state: State) -> State:
+def refitted(estimator: Estimator, state: ParameterValues) -> ParameterValues:
     """The least squares of an estimator, solved to the end by Levenberg and Marquardt."""
-    model = estimator.model.emphasise(estimator.share)
-    model = with_poses(model, estimator.mix) if len(estimator.mix) else model
-    points = float(model.counts.sum())
-    solved = least_squares.solve(SumOfSquares(model), state.batch(), 1, points)
+    model = estimator.model.weight_targets(estimator.share)
+    model = with_pose_errors(model, estimator.mix) if len(estimator.mix) else model
+    points = float(model.pose_counts_by_target.sum())
+    solved = least_squares.solve(PointLeastSquares(model), state.batch(), 1, points)
     return solved.x.take(np.array(0))
 
 
@@ -185,15 +207,15 @@ def test_replicates_are_true_refits(objective, options, robot, noisy, rng):
         u95 = 1e-5 * rng.uniform(1.0, 3.0, data.poses)
         data = replace(data, columns={**data.columns, "u95": u95})
     one, draws = inner(robot, data, objective, **options)
-    change, good = stepped(one, draws, silent)
+    change, good = refit_by_gauss_newton_steps(one, draws, silent_progress)
     assert good.all()
     active = one.identification.active
     sigma = one.uncertainty.sigma[active]
     for number in range(4):
-        rows = np.repeat(np.arange(data.poses), draws.rows(number))
+        rows = np.repeat(np.arange(data.poses), draws.row_counts(number))
         assert len(rows) == data.poses
-        end = refitted(one.estimator.at(rows), one.cell.state)
-        off = between(one.cell.state, end)[active]
+        end = refitted(one.estimator.at_poses(rows), one.cell.parameter_values)
+        off = parameter_step(one.cell.parameter_values, end)[active]
         assert_allclose(change[number] / sigma, off / sigma, atol=SAME)
 
 
@@ -207,15 +229,15 @@ def test_replicates_of_a_robust_fit_give_way_as_it_does(robot, noisy):
     data = noisy.data.with_y(y)
     fit = mc.calibrate(robot, data, "sum", holdout=0.0, loss="huber")
     found = bootstrap(fit, 8, seed=1)
-    draws = draw(groups(data), 8, np.random.default_rng(1))
+    draws = draw_poses(group_repeated_poses(data), 8, np.random.default_rng(1))
     cell = fit.cell
-    state = cell.state
+    state = cell.parameter_values
     sigma = fit.uncertainty.sigma[found.place]
     ours, theirs = found.change / sigma, np.zeros(found.change.shape)
     for number in range(8):
-        rows = np.repeat(np.arange(data.poses), draws.rows(number))
-        fresh = fit_cell(robot, data.take(rows), fit.options, silent)
-        theirs[number] = between(state, fresh.state)[found.place] / sigma
+        rows = np.repeat(np.arange(data.poses), draws.row_counts(number))
+        fresh = fit_cell(robot, data.take(rows), fit.options, silent_progress)
+        theirs[number] = parameter_step(state, fresh.state)[found.place] / sigma
     assert (theirs * ours).sum() / (ours**2).sum() == pytest.approx(1.0, abs=0.15)
     assert np.corrcoef(theirs.ravel(), ours.ravel())[0, 1] > 0.9
 
@@ -223,17 +245,17 @@ def test_replicates_of_a_robust_fit_give_way_as_it_does(robot, noisy):
 def test_replicates_of_a_minimax_are_minimax_fits(robot, noisy):
     """Fitted from scratch on the rows drawn: no worse a worst target, to 1e-6."""
     one, draws = inner(robot, noisy.data, "minimax")
-    change, good = solved_again(one, draws, silent)
+    change, good = refit_minimax_replicates(one, draws, silent_progress)
     assert good.all()
     for number in range(2):
-        rows = np.repeat(np.arange(noisy.data.poses), draws.rows(number))
-        fresh = fit_cell(robot, noisy.data.take(rows), one.options, silent)
-        step = np.zeros(one.estimator.model.names.count)
+        rows = np.repeat(np.arange(noisy.data.poses), draws.row_counts(number))
+        fresh = fit_cell(robot, noisy.data.take(rows), one.options, silent_progress)
+        step = np.zeros(one.estimator.model.names.parameter_count)
         step[one.identification.active] = change[number]
-        model = one.estimator.at(rows).model
+        model = one.estimator.at_poses(rows).model
         ours, theirs = (
-            float((model.cost(state) / model.counts).max())
-            for state in (one.cell.state.step(step), fresh.state)
+            float((model.target_costs(state) / model.pose_counts_by_target).max())
+            for state in (one.cell.parameter_values.step(step), fresh.state)
         )
         assert ours == pytest.approx(theirs, rel=1e-6)
 
@@ -259,20 +281,22 @@ def test_percentiles_lie_about_the_value(found, fit):
 
 def test_rows_of_a_pose_are_drawn_together(rng):
     group = np.array([4, 4, 9, 1, 9, 9])
-    draws = draw(group, 50, rng)
+    draws = draw_poses(group, 50, rng)
     assert draws.times.shape == (50, 3)
     assert np.all(draws.times.sum(axis=1) == 3)
     for number in range(50):
-        rows = draws.rows(number)
+        rows = draws.row_counts(number)
         assert rows[0] == rows[1]
         assert rows[2] == rows[4] == rows[5]
-    assert abs(draw(np.arange(40), 4000, rng).times.mean(axis=0) - 1.0).max() < 5 / np.sqrt(4000)
+    assert abs(draw_poses(np.arange(40), 4000, rng).times.mean(axis=0) - 1.0).max() < 5 / np.sqrt(
+        4000
+    )
 
 
 def test_positions_are_those_of_the_replicates(robot, found, fit):
     """The whole prediction with the replicate's parameters: to second order in changes of 1e-4."""
     q = np.random.default_rng(5).uniform(-1.5, 1.5, (7, 6))
-    places = found.positions(q)
+    places = found.predict_positions(q)
     assert places.shape == (120, 7, 3, 3)
     for number in (0, 50):
         assert_allclose(places[number], whole(robot, found, number).predict(q), rtol=0, atol=2e-7)
@@ -284,17 +308,17 @@ def test_positions_are_those_of_the_replicates(robot, found, fit):
 def whole(robot: mc.Robot, found: Bootstrap, number: int) -> Cell:
     """The cell of one replicate."""
     cell = found.fit.cell
-    state = cell.state
-    step = np.zeros(len(found.fit.uncertainty.names.all))
+    state = cell.parameter_values
+    step = np.zeros(len(found.fit.uncertainty.names.all_names))
     step[found.place] = found.change[number]
-    return Cell.of(robot, state.step(step), cell.target_names)
+    return Cell.from_parameters(robot, state.step(step), cell.target_names)
 
 
 def test_poses_left_out_judge_a_replicate(robot, noisy, found, fit):
     train = fit.data.take(~fit.held)
-    draws = draw(groups(train), 120, np.random.default_rng(3))
+    draws = draw_poses(group_repeated_poses(train), 120, np.random.default_rng(3))
     for number in (0, 60):
-        out = train.take(draws.rows(number) == 0)
+        out = train.take(draws.row_counts(number) == 0)
         rms = mc.evaluate(whole(robot, found, number), out).rms_mm
         assert 1e3 * found.out_of_bag[number] == pytest.approx(rms, rel=1e-3)
     interval = found.rms_interval()
@@ -307,9 +331,9 @@ def test_a_draw_that_shows_a_parameter_no_more_is_lost():
     gram = np.zeros((2, 2, 2))
     gram[0, 0, 0], gram[1, 1, 1] = 1.0, 1e-9
     times = np.array([[1, 1], [2, 0], [0, 2]])
-    good = determined(Draws(times, np.arange(2)), gram, np.zeros(2))
+    good = is_draw_determined(PoseDraws(times, np.arange(2)), gram, np.zeros(2))
     assert good.tolist() == [True, False, False]
-    told = determined(Draws(times, np.arange(2)), gram, np.array([0.1, 1e-9]))
+    told = is_draw_determined(PoseDraws(times, np.arange(2)), gram, np.array([0.1, 1e-9]))
     assert told.all()
 
 

@@ -13,21 +13,22 @@ from problems_watch import SHIFT, checked, seen_anew, shifted
 
 import minimax_cal as mc
 from experiments import one_session
-from experiments.one_session import Job
-from minimax_cal.judging.tolerance import Limit
-from minimax_cal.judging.watching import health, moved
-from minimax_cal.judging.watching.both import (
-    NEW,
-    OLD,
-    Both,
-    Part,
-    fit_variances,
-)
+from experiments.one_session import SessionJob
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.effects import EFFECTS
 from minimax_cal.modelling.simulate import Simulation, Truth, gravity, simulate
+from minimax_cal.robots.joint_sampling import random_joint_values_above_floor
 from minimax_cal.robots.robot import robot_from_dict
-from minimax_cal.robots.sampling import random_poses
+from minimax_cal.validation.monitoring import calibration_check, change_search
+from minimax_cal.validation.monitoring.check_result import LimitVerdict
+from minimax_cal.validation.monitoring.session_pair import (
+    NEW,
+    OLD,
+    RowProducts,
+    SessionPair,
+    fit_variances_by_reml,
+)
+from minimax_cal.validation.tolerance import ToleranceLimit
 
 # ---- watching ------------------------------------------------------------------------------------
 
@@ -49,7 +50,7 @@ def fit(made: Simulation) -> mc.Fit:
 def poses(made: Simulation, count: int, joint: int = 0, by: float = 0.0, seed: int = 1):
     """Poses of the arm with the zero of a joint, counted from 1, shifted; the tracker anew."""
     rng = np.random.default_rng(seed)
-    q = random_poses(made.cell.robot, count, rng)
+    q = random_joint_values_above_floor(made.cell.robot, count, rng)
     return seen_anew(shifted(made.cell, joint - 1, by), q, TRUTH, rng)
 
 
@@ -85,11 +86,13 @@ def test_as_many_poses_as_named_decide_every_second_session(seen, poses):
     rms = np.sqrt(3.0 * (1.0 + 0.3**2))  # mm, of pose and reflector
 
     def session(count: int) -> tuple[np.ndarray, mc.Measurements]:
-        error = 1e-3 * (rng.normal(size=(1, count, 3)) + 0.3 * rng.normal(size=(3, count, 3)))
-        return error, mc.measurements(rng.uniform(-2.0, 2.0, (count, 6)), error.swapaxes(0, 1))
+        error = 1e-3 * (rng.normal(size=(count, 1, 3)) + 0.3 * rng.normal(size=(count, 3, 3)))
+        return error, mc.measurements(rng.uniform(-2.0, 2.0, (count, 6)), error)
 
-    def judged(error: np.ndarray, data: mc.Measurements) -> health.Verdict:
-        return health.judge_limit(Limit("rms", seen * rms), error, data, 0.0, 0)
+    def judged(error: np.ndarray, data: mc.Measurements) -> LimitVerdict:
+        return calibration_check.judge_limit_by_errors(
+            ToleranceLimit("rms", seen * rms), error, data, 0.0, 0
+        )
 
     named = []
     while len(named) < 25:
@@ -144,7 +147,7 @@ def test_not_valid_and_not_decided(fit, made):
 
 def test_a_known_frame_tells_joint_one(fit, made):
     rng = np.random.default_rng(4)
-    q = random_poses(made.cell.robot, 10, rng)
+    q = random_joint_values_above_floor(made.cell.robot, 10, rng)
     cell = shifted(made.cell, 0, SHIFT)
     y = cell.predict(q) + 15e-6 * rng.normal(size=(10, 3, 3))
     found = mc.check(fit, mc.measurements(q, y), "rms 0.5", known="frame,targets")
@@ -168,7 +171,7 @@ def test_what_moved_has_the_sign_of_the_file():
     made = simulate(robot_from_dict(content, "turned"), 50, 3, 3, TRUTH)
     fit = mc.calibrate(made.cell.robot, made.data, "sum")
     rng = np.random.default_rng(4)
-    q = random_poses(made.cell.robot, 10, rng)
+    q = random_joint_values_above_floor(made.cell.robot, 10, rng)
     moved = q + SHIFT * np.eye(6)[0]  # the file's joint 1 has sign +1: its theta1 grows
     y = made.cell.predict(moved) + 15e-6 * rng.normal(size=(10, 3, 3))
     (found,) = mc.check(fit, mc.measurements(q, y), "rms 0.5", known="frame,targets").moved
@@ -191,7 +194,7 @@ def with_foot(
 def test_reflectors_on_the_foot_tell_joint_one(made):
     rng = np.random.default_rng(8)
     fit = mc.calibrate("irb2600", with_foot(made.data, made.cell.base, rng), "sum")
-    q = random_poses(made.cell.robot, 10, rng)
+    q = random_joint_values_above_floor(made.cell.robot, 10, rng)
     base = made.cell.base.copy()
     base[:3, 3] += 0.2
     cell = replace(shifted(made.cell, 0, SHIFT), base=base)
@@ -209,7 +212,7 @@ def test_a_foot_that_tells_less_than_the_instrument_names_nothing(made):
     fit = mc.calibrate("irb2600", with_foot(made.data, base, rng, 3e-4), "sum")
     named = []
     for _ in range(4):
-        q = random_poses(made.cell.robot, 10, rng)
+        q = random_joint_values_above_floor(made.cell.robot, 10, rng)
         y = made.cell.predict(q) + 15e-6 * rng.normal(size=(10, 3, 3))
         data = with_foot(mc.measurements(q, y), base, rng, 3e-4)
         named += [m.parameter for m in mc.check(fit, data, "rms 0.5").moved]
@@ -228,7 +231,7 @@ def giving_way():
     fit = mc.calibrate("irb120", with_foot(made.data, base, rng), "sum")
 
     def seen(count: int, joint: int = 0, by: float = 0.0) -> mc.Measurements:
-        q = random_poses(made.cell.robot, count, rng, truth.span)
+        q = random_joint_values_above_floor(made.cell.robot, count, rng, truth.span)
         bent = q + truth.compliance * gravity(made.cell.robot, q)
         y = shifted(made.cell, joint, by).predict(bent) + 15e-6 * rng.normal(size=(count, 3, 3))
         return with_foot(mc.measurements(q, y), base, rng)
@@ -282,15 +285,17 @@ CUTS = [("ur10", 8, "2"), ("irb2600", 12, "3"), ("irb120", 28, "time")]
 
 @pytest.mark.parametrize(("arm", "seed", "way"), CUTS)
 def test_halves_of_a_session_whose_model_lacks_something_do_not_differ(arm, seed, way):
-    found = one_session.run(Job(arm, seed, way, commands=("compare", "check")))
+    found = one_session.run_session(SessionJob(arm, seed, way, commands=("compare", "check")))
     assert found.compared == ()
     assert found.checked == ()
 
 
 @pytest.mark.parametrize(("arm", "seed", "way"), [("irb2600", 0, "1"), ("irb120", 4, "time")])
 def test_a_joint_that_moved_between_halves_is_named_alone(arm, seed, way):
-    job = Job(arm, seed, way, one_session.DRAWN, commands=("compare", "check"))
-    found = one_session.run(job)
+    job = SessionJob(
+        arm, seed, way, one_session.LACK_OF_FIT_AS_DRAWN, commands=("compare", "check")
+    )
+    found = one_session.run_session(job)
     assert found.joint
     assert found.compared == (found.joint,)
     assert found.checked == (found.joint,)
@@ -301,7 +306,7 @@ def test_halves_of_a_real_session_do_not_differ(name, way):
     robot, path = shared(name)
     data = mc.read_measurements(path)
     data = data.take(np.linspace(0, data.poses - 1, min(data.poses, 300)).astype(int))
-    first = one_session.halves(data, way[1:])
+    first = one_session.find_first_half(data, way[1:])
     a, b = (mc.calibrate(robot, data.take(half), "sum") for half in (first, ~first))
     assert mc.compare(a, b).changed == ()
     assert mc.check(a, data.take(~first), "rms 1").moved == ()
@@ -436,17 +441,25 @@ def test_the_pick_explains_most_and_zero_positions_go_first():
     every, none = np.ones(3, dtype=bool), np.zeros(3, dtype=bool)
     first = np.array([True, False, False])
     square = np.array([30.0, 38.0, 20.0])
-    assert moved.picked(square, every, first)[0] == 0  # a link that is not clearly better
-    clearer = np.array([30.0, 38.0 + moved.CLEARER, 20.0])
-    assert moved.picked(clearer, every, first)[0] == 1
-    assert moved.picked(square, ~first, first)[0] == 1  # the zero position may be chance
-    assert moved.picked(square, every, none)[0] == 1  # no zero position at all: the largest
-    rivals = moved.picked(np.array([30.0, 30.0 - 0.9 * moved.LIKEWISE, -np.inf]), every, none)
+    assert (
+        change_search.select_change(square, every, first)[0] == 0
+    )  # a link that is not clearly better
+    clearer = np.array([30.0, 38.0 + change_search.MIN_LINK_LEAD, 20.0])
+    assert change_search.select_change(clearer, every, first)[0] == 1
+    assert (
+        change_search.select_change(square, ~first, first)[0] == 1
+    )  # the zero position may be chance
+    assert (
+        change_search.select_change(square, every, none)[0] == 1
+    )  # no zero position at all: the largest
+    rivals = change_search.select_change(
+        np.array([30.0, 30.0 - 0.9 * change_search.MAX_ALTERNATIVE_LOSS, -np.inf]), every, none
+    )
     assert rivals == (0, [1])
 
 
 def test_laws_of_the_session_end_with_it():
-    ended = {name for name, effect in EFFECTS.items() if effect.of_session}
+    ended = {name for name, effect in EFFECTS.items() if effect.ends_with_session}
     assert ended == {"frame_drift", "session_jump", "target_shift", "target_reseat"}
 
 
@@ -537,7 +550,7 @@ ROWS, PARTS = 60, 8
 NOISE, FACTOR = 0.5, 4.0
 
 
-def drawn(rng: np.random.Generator, noise: float = NOISE) -> tuple[Both, list[np.ndarray]]:
+def drawn(rng: np.random.Generator, noise: float = NOISE) -> tuple[SessionPair, list[np.ndarray]]:
     """Both sessions with lack of fit of a known size, and the rows that they are made of."""
     u, x = np.sqrt(FACTOR) * rng.normal(size=RANDOM), rng.normal(size=FREE)
     parts, rows = [], []
@@ -548,15 +561,15 @@ def drawn(rng: np.random.Generator, noise: float = NOISE) -> tuple[Both, list[np
         sigma = np.sqrt(noise if new else NOISE)
         error = columns[:, : FREE + RANDOM] @ np.append(x, u) + sigma * rng.normal(size=ROWS)
         rows.append(np.column_stack([columns, error]))
-        parts.append(Part(rows[-1].T @ rows[-1], ROWS, NEW if new else OLD))
+        parts.append(RowProducts(rows[-1].T @ rows[-1], ROWS, NEW if new else OLD))
     asked = np.arange(ASKED)
     component = np.zeros(RANDOM, dtype=int)
-    return Both(tuple(parts), FREE, RANDOM, component, asked, asked < 1, np.ones(0)), rows
+    return SessionPair(tuple(parts), FREE, RANDOM, component, asked, asked < 1, np.ones(0)), rows
 
 
 def test_variances_are_those_that_were_drawn():
     rng = np.random.default_rng(0)
-    found = [fit_variances(drawn(rng)[0]) for _ in range(20)]
+    found = [fit_variances_by_reml(drawn(rng)[0]) for _ in range(20)]
     assert np.mean([v.noise[OLD] for v in found]) == pytest.approx(NOISE, rel=0.05)
     assert np.mean([v.factor[0] for v in found]) == pytest.approx(FACTOR, rel=0.2)
 
@@ -573,7 +586,7 @@ def test_scores_spread_as_their_sigmas_say():
     rng, none = np.random.default_rng(2), np.zeros(0, dtype=int)
     z = []
     for _ in range(40):
-        by, sigma, dof = drawn(rng)[0].scores(none)
+        by, sigma, dof = drawn(rng)[0].candidate_scores(none)
         z.append(by / sigma)
         assert np.all(dof > PARTS - 2)
     assert abs(np.sqrt(np.mean(np.square(z))) - 1.0) < 4.0 / np.sqrt(2 * np.size(z))
@@ -582,19 +595,19 @@ def test_scores_spread_as_their_sigmas_say():
 def test_a_part_left_out_is_judged_by_a_fit_of_the_others():
     both, rows = drawn(np.random.default_rng(3))
     noise = both.variances.noise
-    fitted = both.fitted(np.array([1]))
+    fitted = both.select_fitted_columns(np.array([1]))
     left = PARTS - 1
     scaled = [part / np.sqrt(noise[p.source]) for part, p in zip(rows, both.parts, strict=True)]
     rest = np.concatenate([part for number, part in enumerate(scaled) if number != left])
-    prior = np.diag(np.sqrt(both.ridge(fitted)))
+    prior = np.diag(np.sqrt(both.prior_precision(fitted)))
     matrix = np.concatenate([rest[:, fitted], prior])
     value = np.linalg.lstsq(matrix, np.append(rest[:, -1], np.zeros(len(prior))))[0]
     error = scaled[left][:, -1] - scaled[left][:, fitted] @ value
-    assert_allclose(both.square(both.parts[left], fitted), error @ error, rtol=1e-6)
+    assert_allclose(both.predicted_square(both.parts[left], fitted), error @ error, rtol=1e-6)
 
 
 def test_folds_scatter_as_the_estimate_does():
     rng, none = np.random.default_rng(4), np.zeros(0, dtype=int)
     found = [drawn(rng)[0] for _ in range(40)]
-    ratio = [both.scatter(none, 1) / both.scores(none)[1][1] for both in found]
+    ratio = [both.jackknife_sigma(none, 1) / both.candidate_scores(none)[1][1] for both in found]
     assert np.sqrt(np.mean(np.square(ratio))) == pytest.approx(1.0, abs=0.3)

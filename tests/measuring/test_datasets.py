@@ -32,7 +32,7 @@ def truth() -> mc.Measurements:
 @pytest.fixture
 def published(tmp_path: Path, truth: mc.Measurements, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder as the repository is, with a file of the set's form; and an empty cache."""
-    monkeypatch.delenv(datasets.FOLDER, raising=False)
+    monkeypatch.delenv(datasets.DATA_FOLDER_VARIABLE, raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
     path = tmp_path / "repository" / NAME
@@ -70,7 +70,7 @@ def test_from_a_folder(published, truth, monkeypatch):
     fit = mc.calibrate(robot, data, objective="sum")
     assert fit.accuracy["holdout"].rms_mm < fit.accuracy["nominal"].rms_mm
     monkeypatch.setenv(
-        datasets.FOLDER, str((published / NAME).parent)
+        datasets.DATA_FOLDER_VARIABLE, str((published / NAME).parent)
     )  # the bare file is found too
     _, again = datasets.fetch_ur10()
     assert_allclose(again.y, data.y, rtol=0, atol=0)
@@ -81,7 +81,7 @@ def test_a_folder_without_the_file(published, tmp_path, monkeypatch):
         mc.DataError, match=r"measurements_random_poses.csv: is not there; download"
     ):
         datasets.fetch_ur10("C", published, unverified=True)
-    monkeypatch.setenv(datasets.FOLDER, str(tmp_path / "nowhere"))
+    monkeypatch.setenv(datasets.DATA_FOLDER_VARIABLE, str(tmp_path / "nowhere"))
     with pytest.raises(mc.DataError, match="is not there"):
         datasets.fetch_ur10()
     with pytest.raises(mc.OptionError, match="choose one of A, B, C, D"):
@@ -114,7 +114,7 @@ def test_download_with_another_hash_is_refused(published, server, tmp_path):
 
 
 def test_download_unverified_and_not_there(published, server, monkeypatch):
-    monkeypatch.setitem(datasets.UR10, "B", source_at(server, datasets.UNKNOWN))
+    monkeypatch.setitem(datasets.UR10, "B", source_at(server, datasets.UNKNOWN_HASH))
     _, data = datasets.fetch_ur10("B", unverified=True)
     assert "not verified" in data.notices[0]
     assert np.isfinite(data.y).all()

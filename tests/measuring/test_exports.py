@@ -16,9 +16,9 @@ from conftest import run
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.ground.arrays import Array
+from minimax_cal.core.arrays import Array
 from minimax_cal.measuring.importers import Imported, import_files
-from minimax_cal.measuring.importers.join import match_names
+from minimax_cal.measuring.importers.point_pose_matching import match_point_names_to_poses
 from minimax_cal.modelling.simulate import simulate
 
 DEG = 180.0 / np.pi
@@ -229,7 +229,7 @@ def test_names_that_have_nothing_in_common_go_by_order(truth, tmp_path):
     ],
 )
 def test_patterns_of_names(points, poses, pose, label):
-    match = match_names(points, poses)
+    match = match_point_names_to_poses(points, poses)
     assert match is not None
     assert (match.pose, match.label) == (pose, label)
 

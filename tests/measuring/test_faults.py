@@ -11,15 +11,27 @@ from conftest import shared
 from numpy.testing import assert_allclose, assert_array_equal
 
 import minimax_cal as mc
-from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.faults import find_faults, mended
-from minimax_cal.measuring.faults.fault import Fault, between
-from minimax_cal.measuring.faults.joints import looks_read_back, read_back, unsettled
-from minimax_cal.measuring.faults.nests import ranked
-from minimax_cal.measuring.faults.points import noise, noise_between, swapped_rows
-from minimax_cal.measuring.faults.sessions import jumps, mixed_units, session_jumps
-from minimax_cal.measuring.history import moves
+from minimax_cal.core.arrays import Array
+from minimax_cal.measuring.faults import correct_faults, find_data_faults
+from minimax_cal.measuring.faults.data_fault import DataFault, measure_target_distances
+from minimax_cal.measuring.faults.point_faults import (
+    estimate_noise_from_distances,
+    find_misdeclared_noise,
+    find_swapped_target_rows,
+)
+from minimax_cal.measuring.faults.read_back_joints import (
+    find_lag_in_point_errors,
+    find_read_back_lag,
+    read_back_joint_values,
+)
+from minimax_cal.measuring.faults.session_faults import (
+    find_mixed_unit_sessions,
+    find_session_jumps,
+    locate_frame_jumps,
+)
+from minimax_cal.measuring.faults.target_steps import normal_scores_of_ranks
 from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.measuring.visit_history import joint_moves
 from minimax_cal.modelling.simulate import Simulation, Truth, simulate
 from minimax_cal.robots.robot import robot_from_dict
 
@@ -28,11 +40,11 @@ RIGID = Truth(noise=17.5e-6, noise_per_metre=0.0, compliance=0.0)
 REAL = ("irb120", "fanuc_r2000", "qkm_hl6", "ur10_b", "meca500_r")
 
 
-def of(found: tuple[Fault, ...], effect: str) -> list[Fault]:
+def of(found: tuple[DataFault, ...], effect: str) -> list[DataFault]:
     return [fault for fault in found if fault.effect == effect]
 
 
-def points(found: tuple[Fault, ...]) -> set[tuple[int, int]]:
+def points(found: tuple[DataFault, ...]) -> set[tuple[int, int]]:
     both = [(f.rows, f.targets) for f in of(found, "outliers")]
     return {(int(r), int(t)) for rows, targets in both for r, t in zip(rows, targets, strict=True)}
 
@@ -67,14 +79,14 @@ def test_ranks_are_those_of_scipy_to_the_bit(rng):
     for value in (rng.normal(size=80), rng.normal(size=81).round(1), np.ones(9)):
         score = scipy.stats.norm.ppf((scipy.stats.rankdata(value) - 0.5) / len(value))
         wanted = (score - score.mean()) / max(float(score.std()), 1e-12)
-        assert_array_equal(ranked(value), wanted)
+        assert_array_equal(normal_scores_of_ranks(value), wanted)
 
 
 def test_good_data_are_left_alone(robot):
     for seed in range(40):
         data = simulate(robot, 100 + 2 * seed, 3, seed=seed, truth=TRUTH).data
-        assert find_faults(data) == ()
-        assert_array_equal(mended(data, ()).y, data.y)
+        assert find_data_faults(data) == ()
+        assert_array_equal(correct_faults(data, ()).y, data.y)
 
 
 def test_a_point_moved_within_the_plane_of_the_targets_is_found(robot):
@@ -84,7 +96,7 @@ def test_a_point_moved_within_the_plane_of_the_targets_is_found(robot):
         row, target, angle = int(rng.integers(120)), int(rng.integers(3)), rng.uniform(0, 2 * np.pi)
         e1, e2, _ = flange(data)
         by = 0.3e-3 * (np.cos(angle) * e1[row] + np.sin(angle) * e2[row])
-        found = points(find_faults(displaced(data, row, target, by)))
+        found = points(find_data_faults(displaced(data, row, target, by)))
         assert {r for r, _ in found} <= {row}
         hits += (row, target) in found
         named += found == {(row, target)}
@@ -97,9 +109,9 @@ def test_a_fit_shows_points_moved_across_the_plane(robot):
         data = simulate(robot, 120, 3, seed=seed, truth=RIGID).data
         across = flange(data)[2]
         bad = displaced(data, 17, 1, 0.3e-3 * across[17])
-        assert points(find_faults(bad)) == set()  # no distance tells it
+        assert points(find_data_faults(bad)) == set()  # no distance tells it
         error = left_by(robot, bad)
-        assert points(find_faults(bad, error)) == {(17, 1)}
+        assert points(find_data_faults(bad, error)) == {(17, 1)}
 
 
 def test_two_bad_points_in_a_row_and_a_gross_one(robot):
@@ -107,9 +119,9 @@ def test_two_bad_points_in_a_row_and_a_gross_one(robot):
     bad = displaced(data, 5, 0, np.array([2e-3, 1e-3, -1e-3]))
     bad = displaced(bad, 5, 3, np.array([-1e-3, 2e-3, 1e-3]))
     bad = displaced(bad, 60, 2, np.array([0.05, 0.0, 0.02]))
-    found = find_faults(bad)
+    found = find_data_faults(bad)
     assert points(found) == {(5, 0), (5, 3), (60, 2)}
-    y = mended(bad, found).y
+    y = correct_faults(bad, found).y
     assert np.isnan(y[[5, 5, 60], [0, 3, 2]]).all()
     assert np.isnan(y).sum() == 9
     assert_array_equal(y[np.isfinite(y)], data.y[np.isfinite(y)])
@@ -121,10 +133,10 @@ def test_missing_points_are_no_outliers(robot, rng):
     y[rng.uniform(size=(150, 3)) < 0.2] = np.nan
     data = data.with_y(y)
     data = data.take(np.asarray(data.seen.any(axis=1)))
-    assert find_faults(data) == ()
+    assert find_data_faults(data) == ()
     row = int(np.flatnonzero(data.seen.all(axis=1))[10])
     bad = displaced(data, row, 2, 0.5e-3 * flange(data)[0][row])
-    assert (row, 2) in points(find_faults(bad))
+    assert (row, 2) in points(find_data_faults(bad))
 
 
 @pytest.mark.parametrize("targets", [1, 2])
@@ -132,7 +144,7 @@ def test_few_targets_need_the_fit(robot, targets):
     data = simulate(robot, 80, targets, seed=1, truth=TRUTH).data
     bad = displaced(data, 11, targets - 1, np.array([0.0, 0.03, 0.02]))
     error = left_by(robot, bad)
-    assert points(find_faults(bad, error)) == {(11, targets - 1)}
+    assert points(find_data_faults(bad, error)) == {(11, targets - 1)}
 
 
 def test_swapped_rows_are_found_and_put_right(robot):
@@ -141,10 +153,10 @@ def test_swapped_rows_are_found_and_put_right(robot):
     y[[3, 50]] = y[[3, 50]][:, [1, 0, 2]]
     y[70] = y[70][[2, 0, 1]]
     bad = data.with_y(y)
-    found = find_faults(bad)
+    found = find_data_faults(bad)
     assert [fault.effect for fault in found] == ["swapped_rows"]
     assert_array_equal(found[0].rows, [3, 50, 70])
-    assert_array_equal(mended(bad, found).y, data.y)
+    assert_array_equal(correct_faults(bad, found).y, data.y)
 
 
 def test_a_fit_names_the_targets_of_an_even_triangle(robot):
@@ -157,11 +169,13 @@ def test_a_fit_names_the_targets_of_an_even_triangle(robot):
     y = good.y.copy()
     y[40] = y[40][[1, 2, 0]]
     bad = good.with_y(y)
-    (fault,) = swapped_rows(bad, between(bad), cell.error(bad))
-    assert_array_equal(mended(bad, (fault,)).y, good.y)
+    (fault,) = find_swapped_target_rows(bad, measure_target_distances(bad), cell.error(bad))
+    assert_array_equal(correct_faults(bad, (fault,)).y, good.y)
     y[41] = y[41][[0, 2, 1]]  # the exchange of the alike ones shows in no distance
     exchanged = good.with_y(y)
-    assert_array_equal(swapped_rows(exchanged, between(exchanged))[0].rows, [40])
+    assert_array_equal(
+        find_swapped_target_rows(exchanged, measure_target_distances(exchanged))[0].rows, [40]
+    )
 
 
 def test_a_nest_that_moved_is_found_with_its_time_and_size(robot):
@@ -173,7 +187,7 @@ def test_a_nest_that_moved_is_found_with_its_time_and_size(robot):
         by = 0.2e-3 * (np.cos(angle) * e1 + np.sin(angle) * e2)[first:]
         bad = displaced(data, slice(first, None), target, by)
         shuffle = rng.permutation(120)  # the file need not be in visit order
-        found = find_faults(bad.take(shuffle))
+        found = find_data_faults(bad.take(shuffle))
         (fault,) = found
         assert fault.effect == "target_shift"
         assert target in fault.targets
@@ -184,7 +198,7 @@ def test_a_nest_that_moved_is_found_with_its_time_and_size(robot):
         if len(fault.targets) == 1:  # else its neighbour may have moved, by a little more or less
             assert_allclose(size.value, 0.2e-3, atol=0.04e-3)
             sure += 1
-        assert_array_equal(mended(bad, found).y, bad.y)  # fitted later as an effect
+        assert_array_equal(correct_faults(bad, found).y, bad.y)  # fitted later as an effect
     assert sure >= 8
 
 
@@ -193,7 +207,7 @@ def test_a_nest_that_moved_hides_no_outlier(robot):
     e1, e2, _ = flange(data)
     bad = displaced(data, slice(50, None), 1, 0.5e-3 * e2[50:])
     bad = displaced(bad, 80, 0, 0.4e-3 * (e1 + e2)[80])
-    found = find_faults(bad)
+    found = find_data_faults(bad)
     assert {fault.effect for fault in found} == {"target_shift", "outliers"}
     assert {row for row, _ in points(found)} == {80}
 
@@ -201,7 +215,7 @@ def test_a_nest_that_moved_hides_no_outlier(robot):
 def test_a_steady_drift_is_no_shift(robot):
     data = simulate(robot, 150, 3, seed=3, truth=TRUTH).data
     grown = flange(data)[0] * np.linspace(0.0, 0.2e-3, 150)[:, None]
-    assert of(find_faults(displaced(data, slice(None), 1, grown)), "target_shift") == []
+    assert of(find_data_faults(displaced(data, slice(None), 1, grown)), "target_shift") == []
 
 
 @pytest.mark.parametrize("name", REAL)
@@ -209,7 +223,7 @@ def test_real_arms_raise_no_false_alarm(name):
     robot, path = shared(name)
     data = mc.read_measurements(path)
     error = left_by(robot, data)
-    for found in (find_faults(data), find_faults(data, error)):
+    for found in (find_data_faults(data), find_data_faults(data, error)):
         assert [f.effect for f in found] == (["readback"] if name == "irb120" else [])
 
 
@@ -218,7 +232,7 @@ def test_irb120_with_points_spoilt_on_purpose():
     e1, _, _ = flange(data)
     bad = displaced(data, 100, 1, 0.15e-3 * e1[100])
     bad = displaced(bad, slice(300, None), 2, 0.05e-3 * e1[300:])
-    found = find_faults(bad)
+    found = find_data_faults(bad)
     assert (100, 1) in points(found)
     (shift,) = of(found, "target_shift")
     assert 2 in shift.targets
@@ -227,14 +241,14 @@ def test_irb120_with_points_spoilt_on_purpose():
 
 def test_irb120_read_its_joints_back_too_early():
     data = mc.read_measurements(shared("irb120")[1])
-    (late,) = unsettled(data)
+    (late,) = find_read_back_lag(data)
     amounts = {amount.name: amount.value for amount in late.parameters}
     assert "q is used as commanded" in late.text
     assert amounts["explained"] > 0.95  # one fraction of the last move in each row
     assert amounts["fraction"] > 0.0
     read = {f"qread{j + 1}": data.q[:, j] for j in range(6)}
-    exchanged = replace(data, q=read_back(data), columns={**data.columns, **read})
-    (wrong,) = unsettled(exchanged)
+    exchanged = replace(data, q=read_back_joint_values(data), columns={**data.columns, **read})
+    (wrong,) = find_read_back_lag(exchanged)
     assert "give the commanded" in wrong.text
 
 
@@ -243,22 +257,22 @@ def test_irb120_tells_commanded_from_read_joints_by_its_errors(which):
     path, file = shared("irb120")
     robot, data = mc.load_robot(path), mc.read_measurements(file)
     if which == "read back":
-        data = replace(data, q=read_back(data))
+        data = replace(data, q=read_back_joint_values(data))
     cell = mc.calibrate(robot, data, "sum", holdout=0.0).cell
-    found = looks_read_back(data, cell.error(data), pushes(Simulation(data, cell), data))
+    found = find_lag_in_point_errors(data, cell.error(data), pushes(Simulation(data, cell), data))
     assert bool(found) == (which == "read back")
 
 
 def test_backlash_is_not_taken_for_read_back_joints(robot):
     sim = simulate(robot, 150, 3, seed=1, truth=TRUTH)
     data, push = sim.data, pushes(sim, sim.data)
-    slack = np.einsum("mkcj,mj->mkc", push, 150e-6 * np.sign(moves(data)))
+    slack = np.einsum("mkcj,mj->mkc", push, 150e-6 * np.sign(joint_moves(data)))
     fraction = np.random.default_rng(0).gamma(1.0, 6e-4, size=(150, 1))
-    late = np.einsum("mkcj,mj->mkc", push, fraction * moves(data))
+    late = np.einsum("mkcj,mj->mkc", push, fraction * joint_moves(data))
     for by, expected in ((slack, 0), (late, 1)):
         bad = data.with_y(data.y + by)
         error = left_by(robot, bad)
-        assert len(looks_read_back(bad, error, push)) == expected
+        assert len(find_lag_in_point_errors(bad, error, push)) == expected
 
 
 def test_read_joints_that_agree_are_nothing(robot, rng):
@@ -266,7 +280,7 @@ def test_read_joints_that_agree_are_nothing(robot, rng):
     for size, count in ((1e-6, 0), (1e-3, 1)):
         read = data.q + size * rng.normal(size=data.q.shape)
         columns = {**data.columns, **{f"qread{j + 1}": read[:, j] for j in range(6)}}
-        found = unsettled(replace(data, columns=columns))
+        found = find_read_back_lag(replace(data, columns=columns))
         assert len(found) == count
         assert all("settled" not in fault.text for fault in found)  # noise is no lag
 
@@ -278,12 +292,12 @@ def halves(data: Measurements) -> Measurements:
 
 def test_sessions_in_other_units(robot):
     data = halves(simulate(robot, 100, 3, seed=1).data)
-    assert find_faults(data) == ()
+    assert find_data_faults(data) == ()
     later = data.columns["session"] == "b"
     millimetres = data.with_y(np.where(later[:, None, None], 1e3, 1.0) * data.y)
     degrees = replace(data, q=np.where(later[:, None], np.degrees(data.q), data.q))
     for bad in (millimetres, degrees):
-        (fault,) = mixed_units(bad)
+        (fault,) = find_mixed_unit_sessions(bad)
         assert_array_equal(fault.rows, np.flatnonzero(later))
 
 
@@ -297,10 +311,10 @@ def test_a_base_that_jumps_is_found_at_its_rows(robot):
         step = np.where(visit >= 40, first, 0.0) + np.where(visit >= 75, second, 0.0)
         moved = data.with_y(data.y + step[:, None, None] * np.array([0.0, 0.6, 0.8]))
         fit = mc.calibrate(robot, moved, "sum", holdout=0.0)
-        rows, sizes = jumps(fit.data, fit.error)
+        rows, sizes = locate_frame_jumps(fit.data, fit.error)
         assert visit[rows].tolist() == starts
         assert_allclose(sizes, np.abs([first, second][: len(starts)]), rtol=0.15)
-        assert len(session_jumps(fit.data, fit.error)) == bool(starts)
+        assert len(find_session_jumps(fit.data, fit.error)) == bool(starts)
 
 
 @pytest.mark.parametrize("numbered", [True, False])
@@ -327,7 +341,7 @@ def test_a_jump_has_the_size_by_which_the_points_were_moved(robot, turn, numbere
     for objective in ("sum", "minimax"):
         fit = mc.calibrate(robot, moved, objective, holdout=0.2)
         assert told(fit.notices) == [pytest.approx(1e3 * true, abs=0.02)]
-        _, (of_residual,) = jumps(fit.data, fit.error)
+        _, (of_residual,) = locate_frame_jumps(fit.data, fit.error)
         assert of_residual < 0.97 * true  # what the residual alone would say
     diagnosis = mc.diagnose(robot, moved, quick=True, exclude=["session_jump"])
     assert told(diagnosis.notices) == [pytest.approx(1e3 * true, abs=0.02)]
@@ -348,7 +362,7 @@ def test_noise_other_than_declared(robot, targets):
     twice = twice.with_y(twice.y + 17.5e-6 * np.random.default_rng(0).normal(size=twice.y.shape))
     for declared, count in ((0.04e-3, 0), (0.4e-3, 1)):
         columns = {**twice.columns, "u95": np.full(120, declared)}
-        assert len(noise(replace(twice, columns=columns))) == count
+        assert len(find_misdeclared_noise(replace(twice, columns=columns))) == count
 
 
 def untimed(data: Measurements) -> Measurements:
@@ -371,8 +385,8 @@ def test_a_reseat_shows_in_a_file_that_tells_no_visits(robot, targets):
     for seed, row in enumerate((4, 9, 30, 51, 56)):
         sim = simulate(robot, 60, targets, seed=seed, truth=TRUTH)
         data = untimed(sim.data)
-        assert find_faults(data) == ()
-        (fault,) = find_faults(reseated(sim, data, row, 1, np.array([3e-3, 4e-3, 0.0])))
+        assert find_data_faults(data) == ()
+        (fault,) = find_data_faults(reseated(sim, data, row, 1, np.array([3e-3, 4e-3, 0.0])))
         assert fault.effect == "target_reseat"
         assert fault.place == ("smr2" if targets == 3 else "smr1 or smr2")
         assert abs(int(fault.rows[0]) - row) <= 1
@@ -384,7 +398,7 @@ def test_a_reseat_between_sessions_whose_rows_are_mixed(robot):
     sim = simulate(robot, 60, 3, seed=1, truth=TRUTH)
     bad = reseated(sim, untimed(sim.data), 30, 0, np.array([1e-3, 0.0, 0.0]))
     mixed = halves(bad).take(np.random.default_rng(0).permutation(60))
-    (fault,) = find_faults(mixed)
+    (fault,) = find_data_faults(mixed)
     assert fault.effect == "target_reseat"
     assert len(set(mixed.columns["session"][fault.rows])) == 1
 
@@ -394,14 +408,14 @@ def test_outliers_at_an_end_of_the_file_are_no_reseat(robot):
     rng = np.random.default_rng(0)
     for row in (0, 2, 4):
         data = displaced(data, row, 0, 3e-3 * rng.normal(size=3))
-    assert {fault.effect for fault in find_faults(data)} == {"outliers"}
+    assert {fault.effect for fault in find_data_faults(data)} == {"outliers"}
 
 
 def test_the_longest_part_of_a_reseated_target_stays(robot):
     sim = simulate(robot, 60, 3, seed=1, truth=TRUTH)
     data = reseated(sim, untimed(sim.data), 12, 1, np.array([3e-3, 4e-3, 0.0]))
     data = reseated(sim, data, 48, 1, np.array([-2e-3, 1e-3, 0.0]))
-    gone = data.seen & ~mended(data, find_faults(data)).seen
+    gone = data.seen & ~correct_faults(data, find_data_faults(data)).seen
     assert_array_equal(np.argwhere(gone), [[row, 1] for row in (*range(12), *range(48, 60))])
 
 
@@ -409,10 +423,10 @@ def test_distances_tell_the_noise_beside_a_reseat(robot):
     sim = simulate(robot, 400, 3, seed=1, truth=TRUTH)
     data = reseated(sim, untimed(sim.data), 200, 1, np.array([3e-3, 4e-3, 0.0]))
     for some in (sim.data, data):
-        found = noise_between(some)
+        found = estimate_noise_from_distances(some)
         assert found is not None
         assert_allclose(found[0], TRUTH.noise, rtol=3 * found[1])
-    assert noise_between(simulate(robot, 60, 1, seed=1).data) is None
+    assert estimate_noise_from_distances(simulate(robot, 60, 1, seed=1).data) is None
 
 
 # ---- checks --------------------------------------------------------------------------------------

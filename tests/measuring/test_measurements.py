@@ -10,18 +10,30 @@ from conftest import run
 from numpy.testing import assert_allclose, assert_array_equal
 
 import minimax_cal as mc
-from minimax_cal.measuring.campaigns import campaigns, session_names
-from minimax_cal.measuring.grouping import groups, split
-from minimax_cal.measuring.history import with_history
-from minimax_cal.measuring.importers import cmm, programs
-from minimax_cal.measuring.measurements import FILE, TOOL, USER, Measurements
-from minimax_cal.measuring.set_aside import NO_REASON, counted, entries, left_out, set_aside, whole
-from minimax_cal.measuring.tools import by_tool, side_by_side
+from minimax_cal.measuring.campaigns import join_campaigns, session_names_from_paths
+from minimax_cal.measuring.importers import cmm_reports, robot_programs
+from minimax_cal.measuring.measurements import (
+    SET_ASIDE_BY_FILE,
+    SET_ASIDE_BY_TOOL,
+    SET_ASIDE_BY_USER,
+    Measurements,
+)
+from minimax_cal.measuring.pose_groups import group_repeated_poses, split_train_and_holdout
+from minimax_cal.measuring.set_aside_points import (
+    NO_REASON,
+    format_set_aside_count,
+    merge_set_aside_points_with_reasons,
+    parse_set_aside_cell,
+    set_aside_points_named_by_user,
+    set_points_aside,
+)
+from minimax_cal.measuring.tool_targets import join_targets_of_tools, split_targets_by_tool
+from minimax_cal.measuring.visit_history import add_history_columns
 from minimax_cal.modelling.cell import Cell
-from minimax_cal.modelling.effects.scene import Scene
+from minimax_cal.modelling.effects.scene import PosedArm
 from minimax_cal.modelling.simulate import Simulation, simulate
-from minimax_cal.reading import words
-from minimax_cal.robots.gravity import G
+from minimax_cal.reading import column_words
+from minimax_cal.robots.gravity_torques import STANDARD_GRAVITY
 from minimax_cal.robots.robot import robot_from_dict
 
 HEAD = "q1_rad,q2_rad,smr1_x_mm,smr1_y_mm,smr1_z_mm"
@@ -153,27 +165,27 @@ def test_rows_of_one_pose_stay_together():
     q = rng.normal(size=(20, 6))[np.repeat(np.arange(20), 3)]
     data = mc.measurements(q, rng.normal(size=(60, 3)))
     for seed in range(5):
-        train, held, _ = split(data, 0.3, seed)
+        train, held, _ = split_train_and_holdout(data, 0.3, seed)
         assert held.poses == 18
         assert not set(map(tuple, train.q)) & set(map(tuple, held.q))
     labels = np.array([""] * 58 + ["p", "p"])
     labels[0] = "p"  # rows 0-2 and 57-59 are the same pose by name
     named = mc.measurements(q, rng.normal(size=(60, 3)), pose=labels)
-    assert len(np.unique(groups(named))) == 19
+    assert len(np.unique(group_repeated_poses(named))) == 19
 
 
 def test_the_split_column_decides(tmp_path):
     text = HEAD + ",split\n0,0,1,2,3,train\n1,0,1,2,3,holdout\n"
-    train, held, notices = split(read(text, tmp_path), 0.5, 0)
+    train, held, notices = split_train_and_holdout(read(text, tmp_path), 0.5, 0)
     assert (train.poses, held.poses) == (1, 1)
     assert "split column" in notices[0]
     with pytest.raises(mc.DataError, match=":3: column split: 'test'"):
-        split(read(text.replace("holdout", "test"), tmp_path), 0.5, 0)
+        split_train_and_holdout(read(text.replace("holdout", "test"), tmp_path), 0.5, 0)
 
 
 def test_the_same_seed_gives_the_same_split():
     data = mc.measurements(np.arange(40.0).reshape(20, 2), np.eye(20)[:, :3])
-    first, second, other = (split(data, 0.25, seed)[1].q for seed in (3, 3, 4))
+    first, second, other = (split_train_and_holdout(data, 0.25, seed)[1].q for seed in (3, 3, 4))
     assert_array_equal(first, second)
     assert not np.array_equal(first, other)
 
@@ -303,7 +315,7 @@ def test_one_file_is_read_as_ever(tmp_path):
 def test_targets_go_by_name_and_columns_are_empty_where_a_file_lacks_them():
     one = replace(made(0), target_names=("smr1", "smr3"))
     two = replace(made(1, temperature=np.full(20, 21.0)), target_names=("smr3", "smr2"))
-    data = campaigns([one, two], ["a", "b"])
+    data = join_campaigns([one, two], ["a", "b"])
     assert data.target_names == ("smr1", "smr3", "smr2")
     assert_array_equal(data.y[:20, 1], one.y[:, 1])
     assert_array_equal(data.y[20:, 1], two.y[:, 0])
@@ -313,35 +325,35 @@ def test_targets_go_by_name_and_columns_are_empty_where_a_file_lacks_them():
 
 def test_labels_of_poses_mean_something_in_their_own_file_only():
     labels = np.arange(20).astype(str)
-    data = campaigns([made(0, pose=labels), made(1, pose=labels)], ["a", "b"])
+    data = join_campaigns([made(0, pose=labels), made(1, pose=labels)], ["a", "b"])
     assert len(set(data.columns["pose"])) == 40
 
 
 def test_sessions_of_a_file_come_after_its_name():
     two = made(1, session=np.repeat(["am", "pm"], 10))
-    data = campaigns([made(0), two], ["march", "june"])
+    data = join_campaigns([made(0), two], ["march", "june"])
     assert list(dict.fromkeys(data.columns["session"])) == ["march", "june/am", "june/pm"]
 
 
 def test_a_split_of_one_file_leaves_the_others_for_training():
     held = np.where(np.arange(20) < 5, "holdout", "train")
-    data = campaigns([made(0), made(1, split=held)], ["a", "b"])
+    data = join_campaigns([made(0), made(1, split=held)], ["a", "b"])
     assert_array_equal(data.columns["split"] == "holdout", np.isin(np.arange(40), range(20, 25)))
 
 
 def test_clocks_that_start_again_follow_each_other():
     time = np.arange(20) * 60.0
-    data = with_history(campaigns([made(0, time=time), made(1, time=time)], ["a", "b"]))
+    data = add_history_columns(join_campaigns([made(0, time=time), made(1, time=time)], ["a", "b"]))
     assert np.all(np.diff(data.columns["clock"]) > 0.0)
-    later = campaigns([made(0, time=time), made(1, time=time + 1e6)], ["a", "b"])
+    later = join_campaigns([made(0, time=time), made(1, time=time + 1e6)], ["a", "b"])
     assert_array_equal(later.columns["time"][20:], time + 1e6)
 
 
 def test_points_set_aside_stay_so():
     points = np.zeros((20, 2), dtype=bool)
     points[3, 1] = True
-    two = set_aside(made(1), points, "nest knocked", "user")
-    data = campaigns([made(0), two], ["a", "b"])
+    two = set_points_aside(made(1), points, "nest knocked", "user")
+    data = join_campaigns([made(0), two], ["a", "b"])
     (point,) = data.set_aside
     assert data.aside is not None
     assert point.row == data.aside.line[0] == two.set_aside[0].row + 1000
@@ -351,23 +363,23 @@ def test_points_set_aside_stay_so():
 def test_arms_of_other_joints_are_refused():
     other = mc.measurements(np.zeros((4, 7)), np.random.default_rng(0).normal(size=(4, 3)))
     with pytest.raises(mc.DataError, match=r"has 7 joints.* has 6"):
-        campaigns([made(), other], ["a", "b"])
+        join_campaigns([made(), other], ["a", "b"])
     slide = replace(made(), sliding=np.arange(6) == 2)
     with pytest.raises(mc.DataError, match="joint 3 is a length there"):
-        campaigns([made(), slide], ["a", "b"])
+        join_campaigns([made(), slide], ["a", "b"])
 
 
 def test_a_campaign_under_two_names_is_refused():
     one, other = (replace(made(), source=name, digest="alike") for name in ("a.csv", "b.csv"))
     with pytest.raises(mc.DataError, match=r"b\.csv: holds the same as a\.csv; a campaign counts"):
-        campaigns([one, other], ["a", "b"])
+        join_campaigns([one, other], ["a", "b"])
 
 
 def test_names_of_sessions_tell_the_files_apart(tmp_path):
-    assert session_names(["x/march.csv", "x/june.csv"]) == ["march", "june"]
-    assert session_names(["x/data.csv", "y/data.csv"]) == ["x/data", "y/data"]
+    assert session_names_from_paths(["x/march.csv", "x/june.csv"]) == ["march", "june"]
+    assert session_names_from_paths(["x/data.csv", "y/data.csv"]) == ["x/data", "y/data"]
     with pytest.raises(mc.DataError, match="is given twice"):
-        session_names(["x/data.csv", "x/../x/data.csv"])
+        session_names_from_paths(["x/data.csv", "x/../x/data.csv"])
 
 
 # ---- set aside -----------------------------------------------------------------------------------
@@ -381,10 +393,10 @@ def measured(noisy: Simulation) -> Measurements:
 
 def test_only_the_named_points_are_gone(measured):
     data, line = measured, measured.line
-    found = left_out(data, [f"{line[0]}:smr2=knocked", str(line[3])])
+    found = set_aside_points_named_by_user(data, [f"{line[0]}:smr2=knocked", str(line[3])])
     assert [(p.row, p.pose, p.target, p.why, p.by) for p in found.set_aside] == [
-        (line[0], 1, "smr2", "knocked", USER),
-        *((line[3], 4, name, NO_REASON, USER) for name in data.target_names),
+        (line[0], 1, "smr2", "knocked", SET_ASIDE_BY_USER),
+        *((line[3], 4, name, NO_REASON, SET_ASIDE_BY_USER) for name in data.target_names),
     ]
     assert_array_equal(found.line, np.delete(line, 3))  # a pose without a point
     gone = np.zeros(data.seen.shape, dtype=bool)
@@ -394,21 +406,21 @@ def test_only_the_named_points_are_gone(measured):
     assert_array_equal(found.aside.line, line[[0, 3]])
     assert_array_equal(found.aside.y, np.where(gone[..., None], data.y, np.nan)[[0, 3]])
     assert found.notices[-1].startswith("4 points set aside")
-    assert_array_equal(whole(found).y, data.y)
-    assert left_out(measured, []) is measured
-    assert whole(measured) is measured
+    assert_array_equal(merge_set_aside_points_with_reasons(found).y, data.y)
+    assert set_aside_points_named_by_user(measured, []) is measured
+    assert merge_set_aside_points_with_reasons(measured) is measured
 
 
 def test_what_is_set_aside_twice_comes_once(measured):
-    data = left_out(measured, ["2:smr1", "2:smr1=twice", "3"])
+    data = set_aside_points_named_by_user(measured, ["2:smr1", "2:smr1=twice", "3"])
     assert [(p.row, p.target) for p in data.set_aside] == [
         (2, "smr1"), (3, "smr1"), (3, "smr2"), (3, "smr3")]  # fmt: skip
     mask = np.zeros(data.seen.shape, dtype=bool)
     mask[0] = True
-    more = set_aside(data, mask, "trimmed", TOOL)
+    more = set_points_aside(data, mask, "trimmed", SET_ASIDE_BY_TOOL)
     assert [(p.row, p.pose, p.target) for p in more.set_aside[4:]] == [
         (2, 1, "smr2"), (2, 1, "smr3")]  # fmt: skip
-    assert_array_equal(whole(more).y, measured.y)
+    assert_array_equal(merge_set_aside_points_with_reasons(more).y, measured.y)
 
 
 def test_a_file_keeps_them_with_the_reason_and_who_it_was(measured, tmp_path):
@@ -420,28 +432,28 @@ def test_a_file_keeps_them_with_the_reason_and_who_it_was(measured, tmp_path):
     assert np.isnan(data.y[data.line == 2, 0]).all()
     assert {(p.row, p.target) for p in data.set_aside} == {
         (2, "smr1"), (5, "smr1"), (5, "smr2"), (5, "smr3")}  # fmt: skip
-    assert {(p.why, p.by) for p in data.set_aside} == {("nest, knocked, twice", USER)}
-    assert_allclose(whole(data).y, measured.y, rtol=0, atol=1e-9)
+    assert {(p.why, p.by) for p in data.set_aside} == {("nest, knocked, twice", SET_ASIDE_BY_USER)}
+    assert_allclose(merge_set_aside_points_with_reasons(data).y, measured.y, rtol=0, atol=1e-9)
     mask = np.zeros(data.seen.shape, dtype=bool)
     mask[7, 2] = True
-    mc.write_measurements(second, set_aside(data, mask, "marked deleted", FILE))
+    mc.write_measurements(second, set_points_aside(data, mask, "marked deleted", SET_ASIDE_BY_FILE))
     again = mc.read_measurements(second)
-    assert again.set_aside[-1].by == FILE or again.set_aside[0].by == FILE
+    assert again.set_aside[-1].by == SET_ASIDE_BY_FILE or again.set_aside[0].by == SET_ASIDE_BY_FILE
     assert len(again.set_aside) == 5
 
 
 @pytest.mark.parametrize(
     ("cell", "said"),
     [
-        ("nest knocked", [("", "nest knocked", USER)]),
-        ("smr2: too far [file]", [("smr2", "too far", FILE)]),
-        ("smr1: a; smr3", [("smr1", "a", USER), ("", "smr3", USER)]),
-        ("smr1:", [("smr1", NO_REASON, USER)]),
-        ("a: b [x]", [("", "a: b [x]", USER)]),
+        ("nest knocked", [("", "nest knocked", SET_ASIDE_BY_USER)]),
+        ("smr2: too far [file]", [("smr2", "too far", SET_ASIDE_BY_FILE)]),
+        ("smr1: a; smr3", [("smr1", "a", SET_ASIDE_BY_USER), ("", "smr3", SET_ASIDE_BY_USER)]),
+        ("smr1:", [("smr1", NO_REASON, SET_ASIDE_BY_USER)]),
+        ("a: b [x]", [("", "a: b [x]", SET_ASIDE_BY_USER)]),
     ],
 )
 def test_cells_of_the_column(cell, said):
-    assert entries(cell) == said
+    assert parse_set_aside_cell(cell) == said
 
 
 def test_the_column_names_targets_that_are_there(measured, tmp_path):
@@ -458,8 +470,8 @@ def test_the_column_names_targets_that_are_there(measured, tmp_path):
 
 def test_poses_set_aside_were_visited(measured):
     """The moves of the other poses, and the clock, are those of the whole file."""
-    every = with_history(measured)
-    found = with_history(left_out(measured, ["9", "10:smr1", "20"]))
+    every = add_history_columns(measured)
+    found = add_history_columns(set_aside_points_named_by_user(measured, ["9", "10:smr1", "20"]))
     kept = np.isin(every.line, found.line)
     for name, column in found.columns.items():
         assert_array_equal(column, every.columns[name][kept])
@@ -469,12 +481,15 @@ def test_poses_set_aside_were_visited(measured):
 
 
 def test_how_many_in_words(measured):
-    data = left_out(measured, ["3:smr1"])
-    assert counted(data.set_aside) == "1 point set aside by the user"
+    data = set_aside_points_named_by_user(measured, ["3:smr1"])
+    assert format_set_aside_count(data.set_aside) == "1 point set aside by the user"
     mask = np.zeros(data.seen.shape, dtype=bool)
     mask[:2, 2] = True
-    data = set_aside(data, mask, "trimmed", TOOL)
-    assert counted(data.set_aside) == "3 points set aside (1 by the user, 2 by the program)"
+    data = set_points_aside(data, mask, "trimmed", SET_ASIDE_BY_TOOL)
+    assert (
+        format_set_aside_count(data.set_aside)
+        == "3 points set aside (1 by the user, 2 by the program)"
+    )
 
 
 @pytest.mark.parametrize(
@@ -529,7 +544,7 @@ def test_each_tool_has_reflectors_of_its_own(robot, tmp_path):
     again = tmp_path / "again.csv"
     mc.write_measurements(again, data)
     assert again.read_text() == path.read_text()
-    assert_allclose(by_tool(side_by_side(data)).y, data.y)
+    assert_allclose(split_targets_by_tool(join_targets_of_tools(data)).y, data.y)
     one = tmp_path / "one.csv"
     lines = path.read_text().splitlines()
     kept = [lines[0], *(line for line in lines[1:] if line.endswith("gripper"))]
@@ -562,14 +577,14 @@ def test_torque_of_a_payload_is_that_of_a_mass_at_its_centre():
     data = mc.measurements(q, np.ones((3, 3)) * q.sum(1)[:, None], payload=mass, **columns)
     spot = np.array([[0.05, 0.0, 0.0]])
     cell = Cell(robot, np.eye(4), data.target_names, spot)
-    scene: Scene = cell.scene(data)
+    scene: PosedArm = cell.pose_arm(data)
     at = np.where(np.isfinite(centre), centre, spot)
     pose = robot.pose(q)
     place = np.einsum("mij,mj->mi", pose[:, :3, :3], at) + pose[:, :3, 3]
     elbow = 0.5 * np.stack([np.cos(q[:, 0]), np.sin(q[:, 0])], axis=1)
-    expected = -G * mass * np.stack([place[:, 0], place[:, 0] - elbow[:, 0]])
-    assert_allclose(scene.payload, expected, rtol=0, atol=1e-9)
-    assert_allclose(scene.payload_place.T, place, rtol=0, atol=1e-12)
+    expected = -STANDARD_GRAVITY * mass * np.stack([place[:, 0], place[:, 0] - elbow[:, 0]])
+    assert_allclose(scene.payload_torques, expected, rtol=0, atol=1e-9)
+    assert_allclose(scene.payload_centre_in_base.T, place, rtol=0, atol=1e-12)
 
 
 def test_a_centre_without_its_mass_is_told(tmp_path, robot):
@@ -590,7 +605,7 @@ def test_compliance_counts_where_the_payload_hangs(robot):
     centre = rng.uniform(-0.4, 0.4, (90, 3))
     columns = {f"payload_{a}": centre[:, i] for i, a in enumerate("xyz")}
     whole = mc.measurements(made.data.q, made.data.y, payload=mass, **columns)
-    scene = made.cell.scene(whole)
+    scene = made.cell.pose_arm(whole)
     bend = 2e-6 * scene.gravity.T * robot.sign * [0, 1, 1, 1, 1, 0]
     y = made.cell.predict(made.data.q + bend) + NOISE * rng.normal(size=made.data.y.shape)
     effects = [f"joint_compliance:J{i}" for i in range(2, 6)]
@@ -614,10 +629,10 @@ TEXTS = (
 )
 
 
-WORDS = {found for found in vars(words).values() if isinstance(found, re.Pattern)}
-PATTERNS = [found for module in (cmm, programs) for found in vars(module).values()
+WORDS = {found for found in vars(column_words).values() if isinstance(found, re.Pattern)}
+PATTERNS = [found for module in (cmm_reports, robot_programs) for found in vars(module).values()
             if isinstance(found, re.Pattern) and found not in WORDS]  # fmt: skip
-PATTERNS += [language.cartesian for language in programs.LANGUAGES]
+PATTERNS += [language.cartesian for language in robot_programs.PROGRAM_LANGUAGES]
 
 
 @pytest.mark.parametrize(

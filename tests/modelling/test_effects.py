@@ -11,18 +11,18 @@ from problems_fit import MASSES, SPOTS, weighty
 from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
-from minimax_cal.ground.arrays import Array
-from minimax_cal.modelling.cell import Cell, still
-from minimax_cal.modelling.effects import EFFECTS, Scene, Term
-from minimax_cal.modelling.effects.compliance import taken_up
-from minimax_cal.modelling.effects.scene import Columns
-from minimax_cal.modelling.effects.table import Fitted, fitted_from_list, terms
-from minimax_cal.modelling.effects.time import ROOM
+from minimax_cal.core.arrays import Array
+from minimax_cal.modelling.cell import Cell, build_measurements_at_rest
+from minimax_cal.modelling.effects import EFFECTS, PosedArm, Term
+from minimax_cal.modelling.effects.compliance import soft_start_torque_and_slope
+from minimax_cal.modelling.effects.scene import EffectColumns
+from minimax_cal.modelling.effects.table import Fitted, fitted_effects_from_list, parse_effect_terms
+from minimax_cal.modelling.effects.time_effects import REFERENCE_TEMPERATURE_C
 from minimax_cal.modelling.simulate import gravity
 from minimax_cal.robots import kinematics
-from minimax_cal.robots.gravity import MASS_PER_METRE, G
+from minimax_cal.robots.gravity_torques import ASSUMED_LINK_MASS_PER_METRE, STANDARD_GRAVITY
+from minimax_cal.robots.joint_sampling import random_joint_values_above_floor
 from minimax_cal.robots.robot import robot_from_dict
-from minimax_cal.robots.sampling import random_poses
 
 DOCS = ROOT / "docs" / "effects.md"
 EXACT = 1e-12  # relative: the same arithmetic by another way
@@ -34,7 +34,7 @@ ROBOT = weighty(2, [0.1, -0.05, 1.0], ratio=101.0)
 def visited(robot: mc.Robot, poses: int = 40, seed: int = 0) -> mc.Measurements:
     """Poses in an order, with the columns that laws ask for."""
     rng = np.random.default_rng(seed)
-    q = random_poses(robot, poses, rng)
+    q = random_joint_values_above_floor(robot, poses, rng)
     return mc.measurements(
         q,
         np.ones((poses, 3, 3)) * np.arange(1.0, 1.0 + poses)[:, None, None],
@@ -45,11 +45,11 @@ def visited(robot: mc.Robot, poses: int = 40, seed: int = 0) -> mc.Measurements:
     )
 
 
-def scene_of(robot: mc.Robot, data: mc.Measurements) -> Scene:
-    return Scene.of(robot, data, BASE, SPOTS, robot.turned(data.q))
+def scene_of(robot: mc.Robot, data: mc.Measurements) -> PosedArm:
+    return PosedArm.at_measured_poses(robot, data, BASE, SPOTS, robot.chain_joint_values(data.q))
 
 
-def all_terms(scene: Scene) -> list[Term]:
+def all_terms(scene: PosedArm) -> list[Term]:
     """Every effect at every place, in every variant and some finer ones."""
     out = []
     for name, effect in EFFECTS.items():
@@ -75,7 +75,7 @@ SCENES = {
 }
 
 
-def columns(name: str, place: str, scene: Scene = SCENE, **choice: float) -> Columns:
+def columns(name: str, place: str, scene: PosedArm = SCENE, **choice: float) -> EffectColumns:
     return Term(name, place, choice).columns(scene)
 
 
@@ -95,13 +95,13 @@ def test_columns_have_names_units_and_finite_fields(which):
     scene = SCENES[which]
     for term in all_terms(scene):
         found = term.columns(scene)
-        field = found.displacement(scene)
+        field = found.target_displacements(scene)
         assert len(found.names) == len(found.units) == len(field), term
         assert field.shape[1:] == scene.points.shape, term
         assert np.all(np.isfinite(field)), term
         assert np.all(np.abs(field).max(axis=(1, 2, 3)) > 0.0), term
         assert len(set(found.names)) == len(found.names), term
-        for owner, doubt in found.doubts(scene):
+        for owner, doubt in found.displacement_uncertainties(scene):
             assert 0 <= owner < len(found.names), term
             assert doubt.shape[1:] == scene.points.shape, term
             assert np.all(np.isfinite(doubt)), term
@@ -117,7 +117,7 @@ def test_the_text_of_a_variant_means_that_variant(which):
 
     for term in all_terms(scene):
         if term.choice:
-            (found,) = terms(scene, [term.text], never)
+            (found,) = parse_effect_terms(scene, [term.text], never)
             assert found.text == term.text or dict(found.choice) == dict(term.choice), term
 
 
@@ -126,7 +126,7 @@ def test_what_one_variant_has_does_not_go_with_another():
     plain, *_, last = EFFECTS["joint_compliance"].choices(scene, "J2")
     assert "assumed" in last
     with pytest.raises(mc.OptionError, match="no variant has"):
-        terms(scene, [f"joint_compliance:J2:parts={plain['parts']}:within=3"])
+        parse_effect_terms(scene, [f"joint_compliance:J2:parts={plain['parts']}:within=3"])
 
 
 @pytest.mark.parametrize("which", SCENES)
@@ -134,10 +134,12 @@ def test_columns_are_the_derivative_of_the_points(which):
     """Central difference of the exact points; its own error is of second order in the step."""
     scene = SCENES[which]
     for term in all_terms(scene):
-        field = term.columns(scene).displacement(scene)
+        field = term.columns(scene).target_displacements(scene)
         for i, jacobian in enumerate(field):
             step = 1e-5 / np.abs(jacobian).max() * np.eye(len(field))[i]  # moves by 10 um at most
-            up, down = (Fitted((term,), (sign * step,)).points(scene) for sign in (1.0, -1.0))
+            up, down = (
+                Fitted((term,), (sign * step,)).displaced_targets(scene) for sign in (1.0, -1.0)
+            )
             change = (up - down) / (2.0 * step[i])
             assert_allclose(
                 change, jacobian, rtol=0, atol=1e-5 * np.abs(jacobian).max(), err_msg=term
@@ -154,9 +156,9 @@ def test_a_part_of_the_data_sees_the_same_law(which):
             whole, some = term.columns(scene), term.columns(part)
             assert some.names == whole.names, term
             assert some.units == whole.units, term
-            expected = whole.displacement(scene)[..., rows]
+            expected = whole.target_displacements(scene)[..., rows]
             size = np.abs(expected).max()
-            found = some.displacement(part)
+            found = some.target_displacements(part)
             assert_allclose(found, expected, rtol=0, atol=1e-9 * size, err_msg=term)
 
 
@@ -164,14 +166,14 @@ def test_effects_are_read_back_from_their_json():
     terms = tuple(all_terms(SCENE))
     values = tuple(1e-6 * np.ones(len(term.columns(SCENE).names)) for term in terms)
     told = Fitted(terms, values)
-    again = fitted_from_list(told.to_list())
-    assert_allclose(again.points(SCENE), told.points(SCENE), rtol=0, atol=0)
+    again = fitted_effects_from_list(told.to_list())
+    assert_allclose(again.displaced_targets(SCENE), told.displaced_targets(SCENE), rtol=0, atol=0)
 
 
 # ---------------------------------------------------------------- weight
 
 
-def potential(scene: Scene, q: Array) -> Array:
+def potential(scene: PosedArm, q: Array) -> Array:
     """(m,) potential energy of links and payload at joint values (m, n), frame by frame [J]."""
     robot, payload = scene.robot, scene.column("payload")
     pose = np.broadcast_to(np.eye(4), (len(q), 4, 4))
@@ -186,10 +188,12 @@ def potential(scene: Scene, q: Array) -> Array:
         link[:, 2], link[:, 3] = (0.0, sa, ca, d), (0.0, 0.0, 0.0, 1.0)
         assert beta == 0.0
         pose = pose @ link
-        centre = pose[:, :3, :3] @ scene.masses[1][i] + pose[:, :3, 3]
-        energy = energy + scene.masses[0][i] * G * (centre @ robot.up)
+        centre = pose[:, :3, :3] @ scene.link_masses_and_centres[1][i] + pose[:, :3, 3]
+        energy = energy + scene.link_masses_and_centres[0][i] * STANDARD_GRAVITY * (
+            centre @ robot.up
+        )
     tip = pose[:, :3, :3] @ scene.target_positions.mean(axis=0) + pose[:, :3, 3]
-    return np.asarray(energy + payload * G * (tip @ robot.up))
+    return np.asarray(energy + payload * STANDARD_GRAVITY * (tip @ robot.up))
 
 
 @pytest.mark.parametrize("which", ["masses", "no masses", "coupled"])
@@ -197,7 +201,7 @@ def test_torque_is_minus_the_slope_of_the_potential_energy(which):
     """Of a drive that moves several joints, by its own value."""
     scene = SCENES[which]
     for j in range(6):
-        moved = scene.robot.turned(DATA.q + 1e-30j * scene.robot.sign[j] * np.eye(6)[j])
+        moved = scene.robot.chain_joint_values(DATA.q + 1e-30j * scene.robot.sign[j] * np.eye(6)[j])
         jacobian = potential(scene, moved).imag / 1e-30
         assert_allclose(scene.gravity[j], -jacobian, rtol=0, atol=EXACT * 1e4)
 
@@ -208,7 +212,7 @@ def test_torque_is_the_one_of_pinocchio():
     data = replace(DATA, columns={k: v for k, v in DATA.columns.items() if k != "payload"})
     scene = scene_of(ROBOT, data)
     model = pin.Model()
-    model.gravity.linear = -G * ROBOT.up
+    model.gravity.linear = -STANDARD_GRAVITY * ROBOT.up
     before = pin.SE3.Identity()  # what lies between the frame before and the joint's axis
     parent = 0
     for i, (a, d, theta, alpha, beta) in enumerate(ROBOT.mdh):
@@ -237,25 +241,27 @@ def test_compliant_joints_turn_with_their_torque():
 def test_gears_act_at_drives_and_bearings_at_joints():
     """A gear's error moves the arm as an error of its drive's value; bearings as if uncoupled."""
     scene = SCENES["coupled"]
-    alike = scene_of(ROBOT, replace(DATA, q=COUPLED.turned(DATA.q) * ROBOT.sign))
+    alike = scene_of(ROBOT, replace(DATA, q=COUPLED.chain_joint_values(DATA.q) * ROBOT.sign))
     for term in all_terms(scene):
         found = term.columns(scene)
         if term.effect in ("axis_wobble", "link_bending"):
-            ours, theirs = (term.columns(each).displacement(each) for each in (scene, alike))
+            ours, theirs = (
+                term.columns(each).target_displacements(each) for each in (scene, alike)
+            )
             assert_allclose(ours, theirs, rtol=0, atol=EXACT * np.abs(theirs).max())
-        elif found.only_turns and term.effect != "joint_coupling" and term.place[0] == "J":
+        elif found.moves_joints_only and term.effect != "joint_coupling" and term.place[0] == "J":
             j = int(term.place[1:]) - 1
             by = 1e-7 * found.turn[:, j] * ROBOT.sign[j]
             moved = [COUPLED.pose(DATA.q + one[:, None] * np.eye(6)[j]) for one in by]
             there = [pose[:, :3, :3] @ SPOTS.T + pose[:, :3, 3:] for pose in moved]
             fields = np.moveaxis(there, (1, 2, 3), (3, 2, 1)) - scene.points
             second = max(1e-10, 20.0 * (by**2).max())
-            wanted = 1e-7 * found.displacement(scene)
+            wanted = 1e-7 * found.target_displacements(scene)
             assert_allclose(fields, wanted, rtol=0, atol=second, err_msg=term.text)
     error = Term("joint_coupling", "J3", {"source": 2.0})  # an entry of the matrix that is wrong
-    turn = Fitted((error,), (np.array([1e-3]),)).turn(scene)
+    turn = Fitted((error,), (np.array([1e-3]),)).joint_shifts(scene)
     off = replace(COUPLED, coupling=LINKED + 1e-3 * np.eye(6)[:, 2:3] * np.eye(6)[1])
-    wanted = off.turned(DATA.q) - COUPLED.turned(DATA.q)
+    wanted = off.chain_joint_values(DATA.q) - COUPLED.chain_joint_values(DATA.q)
     assert_allclose(turn * ROBOT.sign[2], wanted, rtol=0, atol=EXACT)
 
 
@@ -269,7 +275,7 @@ def test_a_joint_that_stiffens_gives_way_to_the_first_of_its_torque():
         found = columns("joint_compliance", "J2", **choice)
         assert (found.names, dict(found.fixed)) == (("c2",), {"within_Nm": within})
         assert_allclose(found.turn[0, 1], within * np.tanh(tau / within), rtol=EXACT)
-        assert effect.upward(found).all()
+        assert effect.nonnegative_mask(found).all()
         ends = [c["within"] / np.abs(tau).max() for c in effect.finer(SCENE, choice)]
         assert min(ends) >= 0.03
         assert max(ends) <= 1.5
@@ -281,8 +287,12 @@ def test_a_joint_that_stiffens_gives_way_to_the_first_of_its_torque():
 def test_the_doubts_of_a_joint_that_stiffens_are_those_of_its_torque_there():
     """Against a central difference, whose error is of second order in the step."""
     torque, other = np.linspace(-40.0, 60.0, 25), np.linspace(5.0, -3.0, 25)
-    up, down = (taken_up(torque + sign * 1e-4 * other, 12.0)[0] for sign in (1.0, -1.0))
-    assert_allclose(taken_up(torque, 12.0)[1] * other, (up - down) / 2e-4, rtol=0, atol=1e-8)
+    up, down = (
+        soft_start_torque_and_slope(torque + sign * 1e-4 * other, 12.0)[0] for sign in (1.0, -1.0)
+    )
+    assert_allclose(
+        soft_start_torque_and_slope(torque, 12.0)[1] * other, (up - down) / 2e-4, rtol=0, atol=1e-8
+    )
 
 
 def test_payload_adds_its_torque_even_where_it_never_changes():
@@ -290,7 +300,7 @@ def test_payload_adds_its_torque_even_where_it_never_changes():
     empty = replace(DATA, columns={**DATA.columns, "payload": np.zeros(40)})
     with_load, without = scene_of(ROBOT, loaded), scene_of(ROBOT, empty)
     centre = SCENE.points.mean(axis=0)
-    pull = np.broadcast_to(-7.0 * G * ROBOT.up[:, None], centre.shape)
+    pull = np.broadcast_to(-7.0 * STANDARD_GRAVITY * ROBOT.up[:, None], centre.shape)
     for j in range(6):
         arm = centre - SCENE.links.before[j]
         torque = (SCENE.links.z[j] * np.cross(arm, pull, axis=0)).sum(axis=0)
@@ -303,7 +313,7 @@ def test_measured_torques_replace_computed_ones():
     for j in range(6):
         expected = TAU[f"tau{j + 1}"] * ROBOT.sign[j]
         assert_allclose(scene.gravity[j], expected, rtol=0, atol=0)
-    assert not len(scene.gravity_parts)  # what is measured is not doubted
+    assert not len(scene.gravity_changes_per_sigma)  # what is measured is not doubted
 
 
 @pytest.mark.parametrize("lacks", ["a joint", "a pose", "any change"])
@@ -316,10 +326,10 @@ def test_torques_that_tell_too_little_are_not_used(lacks):
         torques["tau2"][slice(3, 4) if lacks == "a pose" else slice(None)] = np.nan
         torques["tau2"] = torques["tau2"] if lacks == "a pose" else np.zeros(40)
     scene = scene_of(ROBOT, replace(DATA, columns={**DATA.columns, **torques}))
-    assert not scene.measured_torques
+    assert not scene.has_measured_torques
     assert_allclose(scene.gravity, SCENE.gravity, rtol=0, atol=0)
-    assert "computed, not read here" in scene.unused_torques
-    assert SCENES["torques"].unused_torques == SCENE.unused_torques == ""
+    assert "computed, not read here" in scene.unused_torques_notice
+    assert SCENES["torques"].unused_torques_notice == SCENE.unused_torques_notice == ""
 
 
 def test_torques_of_guessed_masses_stay_so_where_torques_are_measured():
@@ -354,10 +364,12 @@ def test_a_tool_beside_the_flange_weighs_on_the_joints():
     found = columns("joint_compliance", "all", scene, **choice)
     tool = [name for name in found.names if "tool" in name]
     assert tool == [f"c{j} (tool {a})" for j in range(2, 7) for a in "xy"]  # J1 stands upright
-    upward = EFFECTS["joint_compliance"].upward(found)
+    upward = EFFECTS["joint_compliance"].nonnegative_mask(found)
     assert upward.tolist() == ["tool" not in name for name in found.names]
     on_axis, beside = (
-        scene.torque(np.array([0, 0, 0, 0, 0, 3.0]), np.array([[0.0, 0.0, 0.0]] * 5 + [spot]))
+        scene.drive_gravity_torques(
+            np.array([0, 0, 0, 0, 0, 3.0]), np.array([[0.0, 0.0, 0.0]] * 5 + [spot])
+        )
         for spot in ([0.0, 0.0, 0.1], [0.03, -0.05, 0.1])
     )
     for j in range(1, 6):
@@ -369,13 +381,16 @@ def test_a_tool_beside_the_flange_weighs_on_the_joints():
 
 def test_doubt_is_the_change_of_torque_for_other_masses():
     """The doubts kept span the most of what one sigma of every mass and centre adds up to."""
-    parts = SCENE.gravity_parts[:, 1]
+    parts = SCENE.gravity_changes_per_sigma[:, 1]
     heavier = ROBOT.mass.copy()
     heavier[1] *= 1.2
-    expected = SCENE.torque(heavier, ROBOT.com)[1] - SCENE.torque(ROBOT.mass, ROBOT.com)[1]
+    expected = (
+        SCENE.drive_gravity_torques(heavier, ROBOT.com)[1]
+        - SCENE.drive_gravity_torques(ROBOT.mass, ROBOT.com)[1]
+    )
     assert_allclose(parts[0], expected, rtol=0, atol=EXACT * 1e4)
     choice, *_ = EFFECTS["joint_compliance"].choices(SCENE, "J2")
-    ((_, moved),) = columns("joint_compliance", "J2", **choice).doubts(SCENE)
+    ((_, moved),) = columns("joint_compliance", "J2", **choice).displacement_uncertainties(SCENE)
     turn = SCENE.jacobian[1]
     kept = np.einsum("rkcm,kcm->rm", moved, turn) / (turn**2).sum(axis=(0, 1))
     whole, told = (part.T @ part for part in (parts, kept))
@@ -387,7 +402,7 @@ def test_doubt_is_the_change_of_torque_for_other_masses():
 # ---------------------------------------------------------------- bending
 
 
-def beam(load: float) -> Scene:
+def beam(load: float) -> PosedArm:
     """Link 1 is a horizontal bar of 2 m along x; link 2 a point mass 0.5 m beyond it."""
     joints = [
         {"a": 2000.0, "d": 0, "theta": 0, "alpha": 0, "mass_kg": 9.0, "com_mm": [-1000, 0, 0]},
@@ -397,20 +412,20 @@ def beam(load: float) -> Scene:
     robot = robot_from_dict({"name": "beam", "units": units, "joints": joints})
     data = mc.measurements(np.zeros((1, 2)), np.ones((1, 1, 3)))
     spot = np.array([[-0.5, 0.0, 0.0]])  # at the end of the bar
-    return Scene.of(robot, data, (np.eye(3), np.zeros(3)), spot, data.q)
+    return PosedArm.at_measured_poses(robot, data, (np.eye(3), np.zeros(3)), spot, data.q)
 
 
 def test_a_level_link_bends_as_the_cantilever_of_the_textbook():
     """Tip force F and moment F e: FL^3/3 + (F e) L^2/2 down, slope FL^2/2 + F e L, per 1/EI."""
     load, length, beyond = 4.0, 2.0, 0.5
-    force = load * G
+    force = load * STANDARD_GRAVITY
     scene = beam(load)
-    sag = -columns("link_bending", "L1", scene).displacement(scene)[0, 0, :, 0]
+    sag = -columns("link_bending", "L1", scene).target_displacements(scene)[0, 0, :, 0]
     expected = force * length**3 / 3.0 + force * beyond * length**2 / 2.0
     assert_allclose(sag, [0.0, 0.0, expected], rtol=EXACT, atol=1e-12)
     jacobian = force * length**2 / 2.0 + force * beyond * length
     farther = replace(scene, points=scene.points + np.array([[0.25], [0.0], [0.0]]))
-    found = -columns("link_bending", "L1", farther).displacement(farther)[0, 0, 2, 0]
+    found = -columns("link_bending", "L1", farther).target_displacements(farther)[0, 0, 2, 0]
     assert_allclose(found, expected + 0.25 * jacobian, rtol=EXACT)
 
 
@@ -426,16 +441,16 @@ def test_a_tool_that_nobody_told_bends_as_a_payload_of_a_kilogram(effect, place)
     ]
     assert [dict(c) for c in EFFECTS[effect].choices(SCENE, place)] == [{}]  # masses are told
     found, plain = (columns(effect, place, empty, tool=t) for t in (1.0, 0.0))
-    assert EFFECTS[effect].upward(found).all()
-    whole, loaded = (columns(effect, place, s).displacement(s)[0] for s in (empty, one))
-    links, tool = found.displacement(empty)
+    assert EFFECTS[effect].nonnegative_mask(found).all()
+    whole, loaded = (columns(effect, place, s).target_displacements(s)[0] for s in (empty, one))
+    links, tool = found.target_displacements(empty)
     scale = np.abs(whole).max()
     assert_allclose(links, whole, rtol=0, atol=0)
-    assert_allclose(plain.displacement(empty), whole[None], rtol=0, atol=0)
+    assert_allclose(plain.target_displacements(empty), whole[None], rtol=0, atol=0)
     assert_allclose(tool, loaded - whole, rtol=0, atol=EXACT * scale)
-    with_payload = columns(effect, place, one, tool=1.0).displacement(one)
+    with_payload = columns(effect, place, one, tool=1.0).target_displacements(one)
     assert_allclose(with_payload, np.stack([loaded, tool]), rtol=0, atol=EXACT * scale)
-    owners = [owner for owner, _ in found.doubts(empty)]
+    owners = [owner for owner, _ in found.displacement_uncertainties(empty)]
     assert owners == [0]  # of the links' masses; the tool's is free
 
 
@@ -446,7 +461,7 @@ def test_links_that_carry_nothing_do_not_bend():
 
 def test_base_tilts_by_the_moment_of_all_weight():
     """omega = C M with M = -sum of m (centre of gravity) x g up, payload at the targets."""
-    found = columns("base_flex", "frame").displacement(SCENE)[0]
+    found = columns("base_flex", "frame").target_displacements(SCENE)[0]
     for m in (0, 17, 39):
         pose, moment = np.eye(4), np.zeros(3)
         for i in range(6):
@@ -454,9 +469,9 @@ def test_base_tilts_by_the_moment_of_all_weight():
                           prismatic=ROBOT.prismatic[: i + 1])  # fmt: skip
             pose = one.pose(DATA.q[m, : i + 1])
             centre = pose[:3, :3] @ ROBOT.com[i] + pose[:3, 3]
-            moment += np.cross(centre, -MASSES[i] * G * ROBOT.up)
+            moment += np.cross(centre, -MASSES[i] * STANDARD_GRAVITY * ROBOT.up)
         tip = pose[:3, :3] @ SPOTS.mean(axis=0) + pose[:3, 3]
-        moment += np.cross(tip, -DATA.columns["payload"][m] * G * ROBOT.up)
+        moment += np.cross(tip, -DATA.columns["payload"][m] * STANDARD_GRAVITY * ROBOT.up)
         expected = np.cross(moment, SCENE.points[:, :, m])
         assert_allclose(found[:, :, m], expected, rtol=0, atol=EXACT * np.abs(expected).max())
 
@@ -465,7 +480,7 @@ def test_bracket_sags_to_gravity_and_not_along_it():
     """A bracket along the flange's axis turns by s x g: not at all where it hangs or stands."""
     pose = ROBOT.pose(DATA.q)
     axis = pose[:, :3, 2]
-    found = columns("tool_flex", "all", lever=1.0).displacement(SCENE)
+    found = columns("tool_flex", "all", lever=1.0).target_displacements(SCENE)
     turn = np.cross(axis, -ROBOT.up)
     arm = SCENE.points - pose[:, :3, 3].T
     expected = np.cross(turn.T[None], arm, axis=1)
@@ -514,10 +529,10 @@ def test_a_gear_error_has_all_orders_up_to_the_highest_found(found, orders):
 
 
 def test_the_whole_of_a_law_can_be_asked_for():
-    (term,) = terms(SCENE, ["gear_error:J2:orders=3"])
+    (term,) = parse_effect_terms(SCENE, ["gear_error:J2:orders=3"])
     assert term.choice == {"orders": 3.0}
     with pytest.raises(mc.CalibrationError, match="no orders 4; choose 2, 3"):
-        terms(SCENE, ["gear_error:J2:orders=4"])
+        parse_effect_terms(SCENE, ["gear_error:J2:orders=4"])
 
 
 def test_gain_and_coupling_turn_in_proportion():
@@ -558,8 +573,8 @@ def test_warm_arm_is_the_arm_with_longer_links():
     """A strain of 1e-5 a kelvin against forward kinematics with lengths scaled."""
     strain = 1e-5
     term = Term("thermal_growth", "all", {"temperature": 1.0})
-    moved = Fitted((term,), (np.array([strain]),)).points(SCENE)
-    scale = 1.0 + strain * (DATA.columns["temperature"] - ROOM)
+    moved = Fitted((term,), (np.array([strain]),)).displaced_targets(SCENE)
+    scale = 1.0 + strain * (DATA.columns["temperature"] - REFERENCE_TEMPERATURE_C)
     long = np.array([[0, 1], [1, 0], [0, 0], [0, 1], [0, 0], [0, 0]])  # d1, a2, d4
     for m in (0, 21):
         mdh = ROBOT.mdh.copy()
@@ -571,8 +586,8 @@ def test_warm_arm_is_the_arm_with_longer_links():
 def test_strains_apart_add_up_to_the_common_one():
     apart = columns("thermal_growth", "all", constant=0.5, apart=1.0)
     assert apart.names == ("strain d1", "strain a2", "strain d4")
-    common = columns("thermal_growth", "all", constant=0.5).displacement(SCENE)
-    assert_allclose(apart.displacement(SCENE).sum(axis=0), common[0], rtol=0, atol=EXACT)
+    common = columns("thermal_growth", "all", constant=0.5).target_displacements(SCENE)
+    assert_allclose(apart.target_displacements(SCENE).sum(axis=0), common[0], rtol=0, atol=EXACT)
 
 
 def test_growth_slows_down_with_its_time_constant():
@@ -592,7 +607,9 @@ def test_a_temperature_that_was_not_read_is_not_zero_degrees():
     gone[3] = np.nan
     scene = scene_of(ROBOT, replace(DATA, columns={**DATA.columns, "temperature": gone}))
     field, whole = term.columns(scene).shift, term.columns(SCENE).shift
-    ratio = (np.nanmean(gone) - ROOM) / (DATA.columns["temperature"][3] - ROOM)
+    ratio = (np.nanmean(gone) - REFERENCE_TEMPERATURE_C) / (
+        DATA.columns["temperature"][3] - REFERENCE_TEMPERATURE_C
+    )
     assert_allclose(field[..., 3], ratio * whole[..., 3], rtol=0, atol=EXACT * 100)
     never = {k: v for k, v in DATA.columns.items() if k != "temperature"}
     scene = scene_of(ROBOT, replace(DATA, columns=never))
@@ -608,7 +625,7 @@ def test_the_base_drifts_as_one_body():
     assert_allclose(found.shift[5], expected, rtol=0, atol=EXACT)
 
 
-def in_sessions(names: str) -> tuple[Array, Scene]:
+def in_sessions(names: str) -> tuple[Array, PosedArm]:
     """Rows of sessions by turns, of which three have frames."""
     columns = {**DATA.columns, "session": np.array([*names])[np.arange(40) % 4]}
     data = replace(DATA, frames={name: np.eye(4) for name in "abc"}, columns=columns)
@@ -645,7 +662,7 @@ def test_a_nest_moves_in_the_flange_after_its_moment():
     since = float(SCENE.column("clock")[15])
     move = np.array([1e-3, -2e-3, 5e-4])
     term = Term("target_shift", "smr2", {"since": since})
-    moved = Fitted((term,), (move,)).points(SCENE)
+    moved = Fitted((term,), (move,)).displaced_targets(SCENE)
     spots = SPOTS + np.array([[0.0], [1.0], [0.0]]) * move
     after = scene_of(ROBOT, DATA).robot.pose(DATA.q)
     there = np.einsum("mij,kj->kim", after[:, :3, :3], spots) + after[:, :3, 3].T
@@ -672,34 +689,41 @@ def test_the_simulator_has_the_gravity_of_the_laws(name, rng):
     n, signs = robot.joints, rng.choice([-1.0, 1.0], robot.joints)
     told = replace(robot, mass=rng.uniform(1, 40, n), com=rng.normal(size=(n, 3)), sign=signs)
     for arm in (robot, told):
-        q = random_poses(arm, 20, rng)
-        scene = Cell(arm, np.eye(4), ("smr1",), np.zeros((1, 3))).scene(still(q, ("smr1",), arm))
+        q = random_joint_values_above_floor(arm, 20, rng)
+        scene = Cell(arm, np.eye(4), ("smr1",), np.zeros((1, 3))).pose_arm(
+            build_measurements_at_rest(q, ("smr1",), arm)
+        )
         assert_allclose(gravity(arm, q), scene.gravity.T * arm.sign, rtol=0, atol=EXACT * 1e4)
-    mass = MASS_PER_METRE * np.linalg.norm(robot.mdh[:, :2], axis=1)
+    mass = ASSUMED_LINK_MASS_PER_METRE * np.linalg.norm(robot.mdh[:, :2], axis=1)
 
     def energy(q: Array) -> Array:
-        ends = kinematics.chain(robot.mdh, q * robot.sign, robot.prismatic).after
+        ends = kinematics.compute_link_frames(robot.mdh, q * robot.sign, robot.prismatic).after
         middle = 0.5 * (ends + np.concatenate([0.0 * ends[:1], ends[:-1]]))
-        return np.asarray(G * np.einsum("n,ncm,c->m", mass, middle, robot.up))
+        return np.asarray(STANDARD_GRAVITY * np.einsum("n,ncm,c->m", mass, middle, robot.up))
 
     for j in np.flatnonzero(~robot.prismatic):
-        slope = energy(random_poses(robot, 5, np.random.default_rng(1)) + 1e-30j * np.eye(n)[j])
-        found = gravity(robot, random_poses(robot, 5, np.random.default_rng(1)))[:, j]
+        slope = energy(
+            random_joint_values_above_floor(robot, 5, np.random.default_rng(1))
+            + 1e-30j * np.eye(n)[j]
+        )
+        found = gravity(robot, random_joint_values_above_floor(robot, 5, np.random.default_rng(1)))[
+            :, j
+        ]
         assert_allclose(found, -slope.imag / 1e-30, rtol=0, atol=EXACT * 1e4)
 
 
 def test_a_law_of_the_wrong_shape_is_an_error_in_words():
-    from minimax_cal.ground.errors import OptionError
-    from minimax_cal.modelling.effects.scene import Columns
-    from minimax_cal.modelling.effects.table import check_columns
-    from minimax_cal.reporting.tables import bare_scene
+    from minimax_cal.core.errors import OptionError
+    from minimax_cal.modelling.effects.scene import EffectColumns
+    from minimax_cal.modelling.effects.table import check_effect_columns
+    from minimax_cal.reporting.diagnosis_tables import build_minimal_posed_arm
 
-    scene = bare_scene()
+    scene = build_minimal_posed_arm()
     right = np.zeros((1, scene.joints, scene.poses))
-    check_columns("mine:J1", Columns(("c",), ("rad",), turn=right), scene)
+    check_effect_columns("mine:J1", EffectColumns(("c",), ("rad",), turn=right), scene)
     with pytest.raises(
         OptionError, match=r"effect mine:J1: turn has the shape .*; give \(1, 6, 1\)"
     ):
-        check_columns("mine:J1", Columns(("c",), ("rad",), turn=right[:, :-1]), scene)
+        check_effect_columns("mine:J1", EffectColumns(("c",), ("rad",), turn=right[:, :-1]), scene)
     with pytest.raises(OptionError, match="its law returned ndarray; give Columns"):
-        check_columns("mine:J1", right, scene)
+        check_effect_columns("mine:J1", right, scene)

@@ -14,16 +14,20 @@ from problems_fit import MASSES, SPOTS, weighty
 from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
-from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.history import with_history
+from minimax_cal.core.arrays import Array
+from minimax_cal.measuring.visit_history import add_history_columns
 from minimax_cal.modelling.effects import EFFECTS, Term
-from minimax_cal.modelling.effects.maps import spread, waves_over
-from minimax_cal.modelling.effects.table import Fitted, terms
-from minimax_cal.modelling.joint_fit import extended, fitted, scene_of
-from minimax_cal.modelling.model import Model, model_of
-from minimax_cal.modelling.parameters import State
+from minimax_cal.modelling.effects.joint_error_maps import sine_count_over_span, sine_factor_sigmas
+from minimax_cal.modelling.effects.table import Fitted, parse_effect_terms
+from minimax_cal.modelling.effects_in_model import (
+    extend_model_with_effects,
+    pose_arm_at_values,
+    split_values_by_effect,
+)
+from minimax_cal.modelling.parameters import ParameterValues
+from minimax_cal.modelling.point_model import PointModel, build_point_model
 from minimax_cal.robots import kinematics
-from minimax_cal.robots.sampling import random_poses
+from minimax_cal.robots.joint_sampling import random_joint_values_above_floor
 
 EXAMPLE = ROOT / "examples" / "own_effect.py"
 NOISE = 15e-6  # standard deviation of a coordinate [m]
@@ -34,7 +38,7 @@ ROBOT = weighty(3)
 def visited(poses: int = 90, seed: int = 1) -> mc.Measurements:
     """Poses that are not measured yet, with the columns that laws ask for."""
     rng = np.random.default_rng(seed)
-    q = random_poses(ROBOT, poses, rng)
+    q = random_joint_values_above_floor(ROBOT, poses, rng)
     nothing = np.arange(poses * 9.0).reshape(poses, 3, 3)
     return mc.measurements(
         q,
@@ -57,7 +61,7 @@ def true_cell(robot: mc.Robot = ROBOT, seed: int = 2) -> mc.Cell:
 
 def with_effects(cell: mc.Cell, data: mc.Measurements, put: dict[str, list[float]]) -> mc.Cell:
     """The cell with effects of these values."""
-    chosen = terms(cell.scene(data), list(put))
+    chosen = parse_effect_terms(cell.pose_arm(data), list(put))
     return replace(cell, effects=Fitted(chosen, tuple(map(np.array, put.values()))))
 
 
@@ -90,7 +94,11 @@ def check_found(fit: mc.Fit, put: dict[str, list[float]], sigmas: float = 4.0) -
 
 
 # factors of sines as the prior of the curve has them
-MAP = 1e-3 * spread(2.0, 1.5, waves_over(1.5)) * np.random.default_rng(4).normal(size=29)
+MAP = (
+    1e-3
+    * sine_factor_sigmas(2.0, 1.5, sine_count_over_span(1.5))
+    * np.random.default_rng(4).normal(size=29)
+)
 CASES: dict[str, list[float]] = {
     "joint_compliance:J2": [6e-7],
     "cross_compliance:J2:source=3": [8e-7],
@@ -143,7 +151,7 @@ def test_effects_are_found_with_every_objective(objective):
     data = visited()
     cell = with_effects(true_cell(), data, put)
     assert len(put["joint_compliance:all"]) == len(cell.effects.terms[0].columns(
-        cell.scene(data)).names)  # fmt: skip
+        cell.pose_arm(data)).names)  # fmt: skip
     fit = mc.calibrate(ROBOT, measured(cell, data), objective=objective, effects=list(put))
     assert str(fit.status) == "converged"
     # the worst points decide alone, and the sigmas told are those of a sum over all points
@@ -157,7 +165,7 @@ def test_finite_turns_are_taken_in_the_second_pass():
     put = {"joint_compliance:J2": [2.5e-6], "joint_compliance:J3": [5e-6]}
     data = visited()
     cell = with_effects(true_cell(), data, put)
-    turn = cell.effects.turn(cell.scene(data))
+    turn = cell.effects.joint_shifts(cell.pose_arm(data))
     assert np.abs(turn).max() > 3e-3
     data = data.with_y(cell.follow(data))  # no noise
     fit = mc.calibrate(ROBOT, data, objective="sum", effects=list(put))
@@ -179,7 +187,7 @@ def test_each_of_several_lines_of_a_gear_has_a_name(tmp_path: Path):
     """The waves a turn tell one from another; a lone line goes without."""
     lines = {"gear_ripple:J3:turns=17": [2e-4, 1e-4], "gear_ripple:J3:turns=31.5": [-1e-4, 3e-4]}
     fit = mc.calibrate(ROBOT, seen(lines), objective="sum", effects=[*lines, "backlash:J2"])
-    names = [p.name for p in fit.parameters if p.of_effect]
+    names = [p.name for p in fit.parameters if p.is_of_effect]
     assert names == [
         "gear_ripple:J3.cos 17/turn", "gear_ripple:J3.sin 17/turn",
         "gear_ripple:J3.cos 31.5/turn", "gear_ripple:J3.sin 31.5/turn", "backlash:J2.b2",
@@ -280,7 +288,7 @@ def test_predictions_hold_what_is_there_at_rest(many):
     """Compliance without payload turns joint 2; nothing else acts before the session begins."""
     _, data, fit = many
     cell = replace(fit.cell, effects=Fitted((), ()))
-    links = kinematics.chain(cell.robot.mdh, data.q * ROBOT.sign, ROBOT.prismatic)
+    links = kinematics.compute_link_frames(cell.robot.mdh, data.q * ROBOT.sign, ROBOT.prismatic)
     centre = links.after + np.einsum("naim,na->nim", axes_of(links), ROBOT.com)
     pull = np.array([0.0, 0.0, -9.80665])
     torque = sum(np.cross((centre[i] - links.before[1]).T, MASSES[i] * pull) for i in range(1, 6))
@@ -292,7 +300,7 @@ def test_predictions_hold_what_is_there_at_rest(many):
     assert_allclose(fit.predict(data.q[3]), fit.predict(data.q)[[3]], rtol=0, atol=1e-12)
 
 
-def axes_of(links: kinematics.Chain) -> Array:
+def axes_of(links: kinematics.LinkFrames) -> Array:
     """(n, axis, 3, m) of every frame: z is the next joint's axis."""
     z = np.concatenate([links.z[1:], links.axes[2:]])
     return np.stack([kinematics.cross(links.y, z), links.y, z], axis=1)
@@ -364,10 +372,10 @@ def test_missing_columns_are_named():
 def test_few_poses_suggest_no_moment():
     """A session too short to look for the moment of a shift: one can still tell it."""
     cell, data = true_cell(), visited(10)
-    scene = cell.scene(with_history(data))
+    scene = cell.pose_arm(add_history_columns(data))
     with pytest.raises(mc.OptionError, match="write target_shift:smr1:since=NUMBER"):
-        terms(scene, ["target_shift:smr1"])
-    (term,) = terms(scene, ["target_shift:smr1:since=0.5"])
+        parse_effect_terms(scene, ["target_shift:smr1"])
+    (term,) = parse_effect_terms(scene, ["target_shift:smr1:since=0.5"])
     assert term.choice == {"since": 0.5}
 
 
@@ -394,14 +402,23 @@ def test_targets_may_be_missing_at_some_poses():
 # ---------------------------------------------------------------- the model
 
 
-def joined(texts: dict[str, list[float]]) -> tuple[mc.Measurements, tuple[Term, ...], State, Model]:
+def joined(
+    texts: dict[str, list[float]],
+) -> tuple[mc.Measurements, tuple[Term, ...], ParameterValues, PointModel]:
     """Data, terms, and the extended model at a state where the effects have values."""
-    data = with_history(visited(30))
+    data = add_history_columns(visited(30))
     cell = with_effects(true_cell(), data, texts)
     data = measured(cell, data)
-    state = State(cell.robot.mdh, cell.base[:3, :3], cell.base[:3, 3], cell.target_positions,
-                  np.concatenate(cell.effects.values))  # fmt: skip
-    model, state = extended(model_of(ROBOT, data), ROBOT, data, state, cell.effects.terms)
+    state = ParameterValues(
+        cell.robot.mdh,
+        cell.base[:3, :3],
+        cell.base[:3, 3],
+        cell.target_positions,
+        np.concatenate(cell.effects.values),
+    )
+    model, state = extend_model_with_effects(
+        build_point_model(ROBOT, data), ROBOT, data, state, cell.effects.terms
+    )
     return data, cell.effects.terms, state, model
 
 
@@ -416,25 +433,27 @@ LARGE = {
 def test_the_model_at_its_values_is_the_cell():
     """Columns, and what finite turns add to them, give the exact points again."""
     data, chosen, state, model = joined(LARGE)
-    effects = fitted(chosen, scene_of(ROBOT, data, model, state), state.effects)
-    cell = mc.Cell.of(ROBOT, state, data.target_names, effects)
+    effects = split_values_by_effect(
+        chosen, pose_arm_at_values(ROBOT, data, model, state), state.effects
+    )
+    cell = mc.Cell.from_parameters(ROBOT, state, data.target_names, effects)
     expected = cell.error(data) @ state.rotation  # into base axes
-    assert_allclose(model.error(state), expected, rtol=0, atol=1e-12)
+    assert_allclose(model.point_errors(state), expected, rtol=0, atol=1e-12)
 
 
 def test_columns_are_the_derivative_of_the_error():
     """Central differences of every parameter, where the error is zero (paper S, eq. 12 ff.)."""
     _, _, state, model = joined(LARGE)
-    off = np.einsum("ij,mkj->kim", state.rotation, model.error(state))
+    off = np.einsum("ij,mkj->kim", state.rotation, model.point_errors(state))
     model = replace(model, y=model.y - off)
-    jacobian = model.jacobian(state)
-    for i in range(model.names.count):
+    jacobian = model.point_jacobian(state)
+    for i in range(model.names.parameter_count):
         size = np.abs(jacobian[..., i]).max()
-        step = 1e-5 / size * np.eye(model.names.count)[i]
-        up, down = (model.error(state.step(sign * step)) for sign in (1.0, -1.0))
+        step = 1e-5 / size * np.eye(model.names.parameter_count)[i]
+        up, down = (model.point_errors(state.step(sign * step)) for sign in (1.0, -1.0))
         slope = -(up - down) / (2.0 * step[i])
         assert_allclose(slope, jacobian[..., i], rtol=0, atol=1e-6 * size,
-                        err_msg=model.names.all[i])  # fmt: skip
+                        err_msg=model.names.all_names[i])  # fmt: skip
 
 
 # ---------------------------------------------------------------- one's own effect

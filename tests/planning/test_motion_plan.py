@@ -11,8 +11,8 @@ from numpy.testing import assert_allclose
 import minimax_cal as mc
 from minimax_cal.dynamics.regressor import regressor
 from minimax_cal.planning import motion_plan as module
-from minimax_cal.planning.motion import Series, at_rest
-from minimax_cal.robots.kinematics import chain
+from minimax_cal.planning.fourier_motion import FourierMotion, project_to_rest_at_ends
+from minimax_cal.robots.kinematics import compute_link_frames
 from minimax_cal.robots.robot import robot_from_dict
 
 ARM = "irb120"
@@ -29,19 +29,21 @@ def loaded() -> module.MotionPlan:
 @pytest.fixture(scope="module")
 def short() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "ROUNDS", 5)
+        patch.setattr(module, "MOTION_IMPROVEMENT_STEPS", 5)
         yield
 
 
 def test_a_series_is_its_own_derivative_and_rests_at_its_ends():
     rng = np.random.default_rng(1)
-    series = Series(rng.normal(size=3), *at_rest(*rng.normal(size=(2, 5, 3))), 7.0)
+    series = FourierMotion(
+        rng.normal(size=3), *project_to_rest_at_ends(*rng.normal(size=(2, 5, 3))), 7.0
+    )
     t = np.linspace(0.0, 7.0, 701)
-    moved = series.at(t)
+    moved = series.evaluate(t)
     assert_allclose(moved.qd[[0, -1]], 0.0, atol=1e-12)
     assert_allclose(moved.qdd[[0, -1]], 0.0, atol=1e-11)
     step = 1e-5
-    ahead, back = series.at(t + step), series.at(t - step)
+    ahead, back = series.evaluate(t + step), series.evaluate(t - step)
     assert_allclose((ahead.q - back.q) / (2.0 * step), moved.qd, atol=1e-7)
     assert_allclose((ahead.qd - back.qd) / (2.0 * step), moved.qdd, atol=1e-6)
 
@@ -50,18 +52,18 @@ def test_the_motion_stays_within_its_limits(loaded):
     robot = mc.load_robot(ARM)
     assert [part.name for part in loaded.parts] == ["fast", "slow", "loaded"]
     for part in loaded.parts:
-        moved = part.series.at(part.series.grid(200.0))
+        moved = part.motion.evaluate(part.motion.sample_times(200.0))
         assert (moved.q > robot.lower + np.radians(1.9)).all()
         assert (moved.q < robot.upper - np.radians(1.9)).all()
         assert np.abs(moved.qd).max() < BETWEEN * SPEED
         assert np.abs(moved.qdd).max() < BETWEEN * ACCELERATION
-        points = chain(robot.mdh, moved.q * robot.sign, robot.prismatic).after
+        points = compute_link_frames(robot.mdh, moved.q * robot.sign, robot.prismatic).after
         moving = np.ptp(points, axis=-1).max(axis=-1) > 1e-3
         low, high = np.array(BOX)[:, :, None]
         assert (points[moving] > low - 5e-3).all()
         assert (points[moving] < high + 5e-3).all()
-    slow = loaded.parts[1].series
-    peaks = np.abs(slow.at(slow.grid(200.0)).qd).max(axis=0)
+    slow = loaded.parts[1].motion
+    peaks = np.abs(slow.evaluate(slow.sample_times(200.0)).qd).max(axis=0)
     assert (peaks < BETWEEN * 0.2).all()
     assert np.median(peaks) > 0.1
 
@@ -83,7 +85,7 @@ def test_couplings_and_joints_without_a_drive(short):
     robot = robot_from_dict(plain)
     assert robot.passive.tolist() == [False, False, False, True, False, False]
     found = mc.plan_motion(robot, duration=6.0)
-    moved = found.parts[0].series.at(found.parts[0].series.grid(20.0))
+    moved = found.parts[0].motion.evaluate(found.parts[0].motion.sample_times(20.0))
     assert_allclose(moved.q[:, 3], 0.0, atol=1e-12)
     assert {t.sigma for t in found.told if t.place == "J4"} == {np.inf}
     assert np.isfinite([t.sigma for t in found.told if t.parameter == "Coulomb"]).sum() == 5
@@ -92,18 +94,21 @@ def test_couplings_and_joints_without_a_drive(short):
 def test_what_is_told_is_what_a_fit_finds(loaded):
     """Repeated fits of friction to torques with the noise that was assumed."""
     robot = mc.load_robot(ARM)
-    model = module.model_of(robot, [part.series for part in loaded.parts])
+    model = module.build_torque_prediction_model(robot, [part.motion for part in loaded.parts])
     rows = []
     for part in loaded.parts:
-        motion = part.series.at(part.series.grid(module.ROWS_HZ))
-        own = [regressor(robot, motion) @ model.basis, module.friction(motion)]
+        motion = part.motion.evaluate(part.motion.sample_times(module.INDEPENDENT_TORQUE_ROWS_HZ))
+        own = [
+            regressor(robot, motion) @ model.base_parameter_basis,
+            module.friction_regressor(motion),
+        ]
         rows.append(np.concatenate(own, axis=-1))
     columns = np.concatenate(rows) / model.noise[:, None]
     white = columns.reshape(-1, columns.shape[-1])
     inverse = np.linalg.pinv(white)
     noise = np.random.default_rng(3).normal(size=(len(white), 400))
     found = (inverse @ noise).std(axis=1)
-    assert_allclose(found, module.sigmas(white), rtol=0.2)
+    assert_allclose(found, module.standard_deviations_from_columns(white), rtol=0.2)
 
 
 def test_the_file_is_read_again_once_torques_are_in_it(loaded, tmp_path):

@@ -10,9 +10,9 @@ from measuring.test_exports import workbook
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.correcting.target_file import read_targets
-from minimax_cal.dynamics.logs import import_logs
-from minimax_cal.ground.arrays import Array
+from minimax_cal.compensation.target_file import read_target_file
+from minimax_cal.core.arrays import Array
+from minimax_cal.dynamics.logs import read_log_files
 from minimax_cal.measuring.campaigns import read_campaigns
 from minimax_cal.robots.robot import load_robot
 
@@ -209,7 +209,7 @@ def test_one_torn_line_of_many_is_left_out_and_named(truth, tmp_path):
         assert_allclose(data.y, np.delete(truth.y, 7, axis=0), rtol=0, atol=ROUNDED)
         assert any(said.endswith("1 torn line is left out (9)") for said in data.notices)
     with pytest.raises(mc.DataError, match=":9: the line is torn; complete it or delete it"):
-        read_targets(tmp_path / "x.csv")
+        read_target_file(tmp_path / "x.csv")
 
 
 @pytest.mark.parametrize(("change", "said"), REFUSED)
@@ -239,7 +239,7 @@ def test_targets_with_a_payload_in_words(truth, tmp_path):
     ]
     lines = ["Programm;Ablage", *(";".join(row) for row in (head, *rows))]
     (tmp_path / "t.csv").write_bytes(text(lines, "cp1252"))
-    found = read_targets(tmp_path / "t.csv").data
+    found = read_target_file(tmp_path / "t.csv").data
     assert_allclose(found.q, truth.q, rtol=0, atol=ROUNDED)
     assert set(found.columns["payload"]) == {1.5}
 
@@ -267,7 +267,7 @@ def test_logs_are_read_as_they_are(kind, tmp_path):
     below = "Mittelwert;" + ";".join(map(comma, values.mean(axis=0)[1:]))
     path = tmp_path / "log.csv"
     path.write_bytes(text(["Antriebsprotokoll 3", ";".join(head), *rows, below], encoding))
-    found = import_logs([path])
+    found = read_log_files([path])
     (one,) = found.runs
     assert_allclose(one.q, MOVED, rtol=0, atol=ROUNDED)
     assert_allclose(one.torque, HELD, rtol=0, atol=1e-4)
@@ -307,9 +307,9 @@ def test_robots_are_read_as_they_are(kind, tmp_path):
 
 def test_accents_are_no_chinese_signs(tmp_path):
     """In cp1252 the two letters before the e of Größe are one sign of GB 2312, a rare one."""
-    from minimax_cal.reading.sheet import open_text
+    from minimax_cal.reading.text_sheet import read_text_sheet
 
     for words, encoding in (("Größe; Süßöl; Île", "cp1252"), ("关节, 坐标, 毫米, 镕", "gbk")):
         (tmp_path / "x.csv").write_bytes(words.encode(encoding))
-        assert Path(open_text(tmp_path / "x.csv").path).name == "x.csv"
-        assert open_text(tmp_path / "x.csv").text == words
+        assert Path(read_text_sheet(tmp_path / "x.csv").path).name == "x.csv"
+        assert read_text_sheet(tmp_path / "x.csv").text == words

@@ -13,20 +13,24 @@ from numpy.testing import assert_allclose
 from test_report import WORDING, Seen
 
 import minimax_cal as mc
-from minimax_cal.diagnosing.result import load_diagnosis
-from minimax_cal.dynamics.regressor import Motion
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.tables import Table
-from minimax_cal.judging.tolerance import NOT_PASSED, NOT_STATED, PASSED, limits_of
-from minimax_cal.measuring.history import with_history
+from minimax_cal.core.arrays import Array
+from minimax_cal.core.tables import Table
+from minimax_cal.diagnosing.diagnosis import load_diagnosis
+from minimax_cal.dynamics.regressor import JointMotion
+from minimax_cal.measuring.visit_history import add_history_columns
 from minimax_cal.modelling.simulate import Truth, simulate
-from minimax_cal.reporting import report
-from minimax_cal.reporting.html import Figure, compose, page, read_sources
-from minimax_cal.reporting.html.document import Wording
-from minimax_cal.reporting.html.facts import FACTS
-from minimax_cal.reporting.html.first_page import Signed, signed, worst_joint
-from minimax_cal.reporting.html.motion import compose_motion, motion_of
-from minimax_cal.reporting.html.sources import Sources
+from minimax_cal.reporting import report_file
+from minimax_cal.reporting.html import ChartBlock, build_report, html_page, read_report_sources
+from minimax_cal.reporting.html.cell_facts import FACT_LABELS
+from minimax_cal.reporting.html.first_page import (
+    ReportJudgement,
+    describe_most_rotated_joint,
+    judge_sources,
+)
+from minimax_cal.reporting.html.motion_report import build_motion_report, find_motion_diagnosis
+from minimax_cal.reporting.html.report_builder import ReportRequest
+from minimax_cal.reporting.html.report_sources import ReportSources
+from minimax_cal.validation.tolerance import NOT_PASSED, NOT_STATED, PASSED, parse_limits
 
 # ---- first page ----------------------------------------------------------------------------------
 
@@ -39,8 +43,8 @@ def whole(results: Path) -> Path:
     return path
 
 
-def rendered(wording: Wording, *paths: Path) -> Seen:
-    return Seen(page.render(compose(read_sources(paths), wording)))
+def rendered(wording: ReportRequest, *paths: Path) -> Seen:
+    return Seen(html_page.render_html(build_report(read_report_sources(paths), wording)))
 
 
 def rows(seen: Seen) -> dict[str, list[str]]:
@@ -125,29 +129,33 @@ def test_the_page_says_which_model_is_signed(results, whole):
 def test_the_worst_joint_is_the_one_that_effects_turn_most(whole, results):
     """The rigid arm at joints turned so sees the targets where the arm with its effects does."""
     fit = mc.load_fit(whole)
-    (said,) = worst_joint(read_sources([whole]))
+    (said,) = describe_most_rotated_joint(read_report_sources([whole]))
     known = re.search(r"joint (\d), turned ([\d.]+) degrees .*\(line (\d+);", said)
     assert known
-    turn = fit.cell.effects.turn(fit.cell.scene(with_history(fit.data)))
+    turn = fit.cell.effects.joint_shifts(fit.cell.pose_arm(add_history_columns(fit.data)))
     rigid = replace(fit.cell, effects=type(fit.cell.effects)((), ()))
     assert_allclose(rigid.predict(fit.data.q + turn), fit.cell.predict(fit.data.q), atol=1e-12)
     assert float(known[2]) == pytest.approx(np.degrees(np.abs(turn).max()), abs=5e-4)
     row = np.flatnonzero(fit.data.line == int(known[3]))[0]
     assert abs(turn[row, int(known[1]) - 1]) == np.abs(turn).max()
-    assert not list(worst_joint(read_sources([results / "fit.json"])))  # geometry turns none
+    assert not list(
+        describe_most_rotated_joint(read_report_sources([results / "fit.json"]))
+    )  # geometry turns none
 
 
 def test_pages_say_how_far_effects_turn_a_joint_and_by_which_parameters(whole, results):
     fit, seen = mc.load_fit(whole), rendered(WORDING, whole, results / "gap.json")
-    turn = 1e3 * np.abs(fit.cell.effects.turn(fit.cell.scene(with_history(fit.data))))
+    turn = 1e3 * np.abs(
+        fit.cell.effects.joint_shifts(fit.cell.pose_arm(add_history_columns(fit.data)))
+    )
     joints = seen.tables["error after geometry, as rotations of each joint alone"][1:]
     assert [row[-2] for row in joints] == [f"{most:.4f}" for most in turn.max(axis=0)]
     assert [row[-1] for row in joints] == [f"line {fit.data.line[i]}" for i in turn.argmax(axis=0)]
     effects = next(rows for title, rows in seen.tables.items() if "beyond geometry" in title)
-    known = [p for p in fit.parameters if p.of_effect and p.identifiable]
+    known = [p for p in fit.parameters if p.is_of_effect and p.identifiable]
     assert all(f"{p.value:.4g}" in str(effects) for p in known)
     kept = [p for p in fit.parameters if not p.identifiable]
-    whys = [p.why_in_words if p.of_effect else p.why_not for p in kept]
+    whys = [p.reason_for_display if p.is_of_effect else p.why_not for p in kept]
     assert kept
     assert all(why in seen.text["parameters"] for why in whys)
 
@@ -155,7 +163,7 @@ def test_pages_say_how_far_effects_turn_a_joint_and_by_which_parameters(whole, r
 def test_rungs_of_a_diagnosis(results, tmp_path):
     gap = load_diagnosis(results / "gap.json")
     for number, step in ((0, gap.ladder[0]), (1, gap.ladder[1]), (None, gap.ladder[-1])):
-        wording = Wording("2026-11-21", rung=number)
+        wording = ReportRequest("2026-11-21", rung=number)
         found = rows(rendered(wording, results / "gap.json"))
         found = found.get("RMS, inside") or found["corrected targets, RMS, inside"]
         assert found[0] == f"{step.holdout.poses}"
@@ -172,7 +180,7 @@ def test_too_few_poses_leave_a_maximum_open(robot, tmp_path):
     content = fit.to_dict()
     del content["accuracy"]["cv"], content["arrays"]["crossed"]
     mc.Fit.from_dict(content).save(tmp_path / "old.json")
-    wording = Wording("2026-11-21", limits=limits_of("max 5"))
+    wording = ReportRequest("2026-11-21", limits=parse_limits("max 5"))
     text = rendered(wording, tmp_path / "old.json").text["verdict"]
     assert "Not stated" in text
     assert "9 poses are too few for a maximum: at least 19 are needed" in text
@@ -186,7 +194,7 @@ def test_facts_are_of_the_file_or_to_be_filled_in(results, tmp_path, refuses):
     assert "<dd>26-104711</dd>" in text
     assert "<dd>12</dd>" in text
     assert "&lt;b&gt;Example&lt;/b&gt;" in text
-    assert text.count('class="blank"') == len(FACTS) - 2
+    assert text.count('class="blank"') == len(FACT_LABELS) - 2
     for content, words in (
         ('serial = "1"', "the key 'serial' is not known"),
         ("serial_number = ", "is not TOML"),
@@ -201,7 +209,9 @@ def test_paper_and_picture_by_the_ending(results, tmp_path, monkeypatch):
     assert run("report", results / "fit.json", "-o", tmp_path / "page.png") == 0
     assert (tmp_path / "page.png").read_bytes().startswith(b"\x89PNG")
     printed: list[tuple[str, Path]] = []  # by a browser in `test_pdf_holds_the_whole_report`
-    monkeypatch.setattr(report, "print_pdf", lambda page, path, _: printed.append((page, path)))
+    monkeypatch.setattr(
+        report_file, "write_pdf", lambda page, path, _: printed.append((page, path))
+    )
     assert run("report", results / "fit.json", "-o", tmp_path / "page.pdf") == 0
     ((text, path),) = printed
     assert path == tmp_path / "page.pdf"
@@ -229,8 +239,8 @@ def between(fit: mc.Fit) -> str:
     return f"rms {0.5 * (low + high):.4f}"
 
 
-def judged(fit: mc.Fit, limits: str, *deliver: str) -> Signed:
-    return signed(read_sources([fit]), limits_of(limits), "inside", None, deliver)
+def judged(fit: mc.Fit, limits: str, *deliver: str) -> ReportJudgement:
+    return judge_sources(read_report_sources([fit]), parse_limits(limits), "inside", None, deliver)
 
 
 def test_a_file_is_judged_by_what_it_reaches(fit, between):
@@ -244,9 +254,9 @@ def test_a_file_is_judged_by_what_it_reaches(fit, between):
     ):
         found = judged(fit, between, *names)
         assert found.verdict == verdict
-        assert found.row
+        assert found.governing_row
         own = mc.deliver(fit, of)
-        assert found.row.delivered.format == of
+        assert found.governing_row.delivered.format == of
         assert found.claims[0].rms.value == pytest.approx(own.figures.rms, rel=1e-9)
         told = [row.delivered.format for row in found.rows]
         assert told == list(names or ("compensate", "urdf", "mjcf"))
@@ -259,9 +269,9 @@ def test_geometry_alone_is_its_own_deliverable(between):
     made = simulate("irb2600", 120, 3, seed=4)
     plain = mc.calibrate("irb2600", made.data, "sum")
     alone = judged(plain, between)
-    assert alone.row is None
+    assert alone.governing_row is None
     named = judged(plain, between, "urdf")
-    assert named.row
+    assert named.governing_row
     assert named.claims == alone.claims
     assert named.verdict == alone.verdict
 
@@ -270,7 +280,7 @@ def test_without_measurements_nothing_is_stated(fit, between, tmp_path):
     fit.save(tmp_path / "fit.json", poses=False)
     found = judged(mc.load_fit(tmp_path / "fit.json"), between, "urdf")
     assert found.verdict == NOT_STATED
-    assert "holds no measurements" in found.judged[0].why
+    assert "holds no measurements" in found.judgements[0].why
 
 
 def test_the_page_and_the_command_say_for_which_file(fit, between, tmp_path, refuses, says):
@@ -348,44 +358,61 @@ def test_outliers_that_were_kept_are_named(files):
 
 
 def test_with_room_enough_it_is_passed_with_them_too(files):
-    found = signed(read_sources([files / "used.json"]), limits_of("rms 2"), "inside", None)
-    assert (found.sentence, found.verdict) == (f"{PASSED} inside the measured region", PASSED)
-    assert found.lines()[2].startswith(f"{2 * BAD} points set aside by the user; with them RMS")
+    found = judge_sources(
+        read_report_sources([files / "used.json"]), parse_limits("rms 2"), "inside", None
+    )
+    assert (found.verdict_sentence, found.verdict) == (
+        f"{PASSED} inside the measured region",
+        PASSED,
+    )
+    assert found.list_terminal_lines()[2].startswith(
+        f"{2 * BAD} points set aside by the user; with them RMS"
+    )
 
 
 def test_a_diagnosis_alone_says_it_as_well(files):
-    found = signed(read_sources([files / "gap.json"]), limits_of("rms 0.1"), "inside", None)
+    found = judge_sources(
+        read_report_sources([files / "gap.json"]), parse_limits("rms 0.1"), "inside", None
+    )
     assert found.verdict == PASSED
-    assert found.sentence.startswith(f"{PASSED} without {2 * BAD} points set aside by the user")
+    assert found.verdict_sentence.startswith(
+        f"{PASSED} without {2 * BAD} points set aside by the user"
+    )
 
 
 def test_without_any_the_page_says_so(files):
-    sources = read_sources([files / "poses.json"])
-    found = signed(sources, limits_of("rms 2"), "inside", None)
-    assert (found.set_aside, found.judged_with) == ((), ())
-    assert "No measured point was set aside." in page.render(compose(sources, WORDING))
+    sources = read_report_sources([files / "poses.json"])
+    found = judge_sources(sources, parse_limits("rms 2"), "inside", None)
+    assert (found.set_aside, found.judgements_with_set_aside) == ((), ())
+    assert "No measured point was set aside." in html_page.render_html(
+        build_report(sources, WORDING)
+    )
 
 
 def test_what_one_of_two_results_sets_aside_is_said(files):
     """The calibration sets nothing aside, and the diagnosis of the same measurements does."""
     fit, gap = mc.load_fit(files / "used.json"), load_diagnosis(files / "gap.json")
-    found = signed(Sources(replace(fit, set_aside=()), gap), (), "inside", None)
-    assert found.aside[0].startswith(f"In the diagnosis: {2 * BAD} points set aside by the user")
-    both = signed(Sources(fit, gap), (), "inside", None)
-    assert [said[:22] for said in both.aside] == [f"{2 * BAD} points set aside by"]  # once, of both
+    found = judge_sources(ReportSources(replace(fit, set_aside=()), gap), (), "inside", None)
+    assert found.set_aside_sentences[0].startswith(
+        f"In the diagnosis: {2 * BAD} points set aside by the user"
+    )
+    both = judge_sources(ReportSources(fit, gap), (), "inside", None)
+    assert [said[:22] for said in both.set_aside_sentences] == [
+        f"{2 * BAD} points set aside by"
+    ]  # once, of both
 
 
 # ---- report motion -------------------------------------------------------------------------------
 
 
-MOTION_WORDING = Wording("2026-11-25", author="A. Smith", appendix=True)
+MOTION_WORDING = ReportRequest("2026-11-25", author="A. Smith", appendix=True)
 
 
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A motion diagnosis that names the rotor of joint 3."""
 
-    def rotor(motion: Motion, rigid: Array, time: Array) -> Array:
+    def rotor(motion: JointMotion, rigid: Array, time: Array) -> Array:
         return np.stack([0.0 * time, 0.0 * time, 0.3 * motion.qdd[:, 2]], axis=1)
 
     path = tmp_path_factory.mktemp("motion") / "motion.json"
@@ -394,19 +421,19 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_sections_hold_the_budget_the_curves_and_the_run_left_out(saved):
-    source = motion_of([saved])
+    source = find_motion_diagnosis([saved])
     assert source
-    page = compose_motion(source, MOTION_WORDING)
+    page = build_motion_report(source, MOTION_WORDING)
     blocks = {section.name: section.blocks for section in page.sections}
     budget = [one for one in blocks["budget"] if isinstance(one, Table)]
-    last = source.found.budget[-1]
+    last = source.diagnosis.budget[-1]
     assert budget[0].rows[-1] == (last.name, *last.holdout_rms)
     assert budget[1].rows[-1] == (last.name, *last.holdout_rms_moving)
-    figures = {one.name: one for one in blocks["where"] if isinstance(one, Figure)}
+    figures = {one.name: one for one in blocks["where"] if isinstance(one, ChartBlock)}
     assert sorted(figures) == ["joint-1", "joint-2", "joint-3"]
     measured, predicted, band, curve = figures["joint-3"].traces
-    assert measured["y"] == pytest.approx(source.found.held_run.measured[2], rel=1e-5)
-    assert predicted["y"] == pytest.approx(source.found.held_run.predicted[2], rel=1e-5)
+    assert measured["y"] == pytest.approx(source.diagnosis.held_run.measured[2], rel=1e-5)
+    assert predicted["y"] == pytest.approx(source.diagnosis.held_run.predicted[2], rel=1e-5)
     assert len(band["y"]) == 2 * len(curve["y"])
     assert f"{last.holdout_rms_moving[2]:.3g} N m" in figures["joint-3"].says
     assert blocks["provenance"][0].rows[0][2] == source.file.digest

@@ -11,13 +11,13 @@ from scipy.spatial.transform import Rotation
 from test_report import Seen
 
 import minimax_cal as mc
-from minimax_cal.fitting.several.kinds import relative
-from minimax_cal.fitting.several.result import RelativeCalibration
+from minimax_cal.fitting.multi_instrument.relative_calibration import relative
+from minimax_cal.fitting.multi_instrument.relative_result import RelativeCalibration
 from minimax_cal.instruments import flange_poses
-from minimax_cal.judging.bootstrap import bootstrap
-from minimax_cal.modelling.frames import frames_of, tables_of
+from minimax_cal.modelling.cell_frames import build_cell_frame_tables, build_cell_frames
 from minimax_cal.modelling.simulate import simulate
-from minimax_cal.robots.transforms import transform
+from minimax_cal.robots.transforms import build_transform
+from minimax_cal.validation.bootstrap import bootstrap
 
 BASE = ("base", "base_nominal", "base_correction")
 TOOL = ("tool", "tool_nominal", "tool_correction")
@@ -56,7 +56,7 @@ def test_the_tool_is_the_reflectors_as_one_body(fit):
     spots = fit.nominal.target_positions
     middle = spots.mean(axis=0)
     there = (spots - middle) @ known[1].as_matrix().T + middle + known[0]
-    frames = frames_of(replace(fit.cell, target_positions=there), fit.nominal)
+    frames = build_cell_frames(replace(fit.cell, target_positions=there), fit.nominal)
     assert_allclose(frames["tool_correction"].xyz_mm, 1e3 * known[0], rtol=0, atol=1e-9)
     assert_allclose(frames["tool_correction"].abc_deg, [3.0, -2.0, 1.0], rtol=0, atol=1e-9)
     assert_allclose(frames["tool"].xyz_mm, 1e3 * there.mean(axis=0), rtol=1e-12)
@@ -67,16 +67,18 @@ def test_reflectors_that_tell_no_turn_make_no_tool(fit):
     line = np.arange(3.0)[:, None] * [0.05, 0.02, 0.0]
     for spots in (line, line[:2]):
         cells = [replace(cell, target_positions=spots) for cell in (fit.cell, fit.nominal)]
-        assert list(frames_of(*cells)) == list(BASE)
-    assert list(frames_of(fit.cell, None)) == ["base"]
+        assert list(build_cell_frames(*cells)) == list(BASE)
+    assert list(build_cell_frames(fit.cell, None)) == ["base"]
 
 
 def test_a_further_session_has_its_instrument(fit):
-    away = transform(np.eye(3), np.array([0.5, 0.0, 0.0]))
+    away = build_transform(np.eye(3), np.array([0.5, 0.0, 0.0]))
     sessions = replace(fit.cell.sessions, frames={"monday": np.eye(4), "tuesday": away})
-    frames = frames_of(replace(fit.cell, sessions=sessions), fit.nominal)
+    frames = build_cell_frames(replace(fit.cell, sessions=sessions), fit.nominal)
     assert frames["session tuesday"].xyz_mm == (500.0, 0.0, 0.0)
-    assert "instrument of session tuesday" in [row[0] for row in tables_of(frames)[0].rows]
+    assert "instrument of session tuesday" in [
+        row[0] for row in build_cell_frame_tables(frames)[0].rows
+    ]
 
 
 def test_people_read_a_distance_that_is_the_norm_in_json(tmp_path, noisy, says):
@@ -130,7 +132,7 @@ def test_whole_poses_have_base_and_tool(robot):
     made = simulate(robot, 60, 3, seed=2)
     base, tool = (
         made.cell.base,
-        transform(
+        build_transform(
             Rotation.from_euler("ZYX", [20.0, 5.0, -8.0], degrees=True).as_matrix(),
             np.array([0.03, 0.01, 0.2]),
         ),

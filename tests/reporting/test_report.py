@@ -28,28 +28,37 @@ from plotly.offline import get_plotlyjs
 
 import minimax_cal as mc
 from minimax_cal.cli.report import report_command
-from minimax_cal.ground.errors import CalibrationError, OptionError
-from minimax_cal.ground.tables import Table
-from minimax_cal.ground.words import visible
-from minimax_cal.modelling.effects.words import name_effect, name_step
+from minimax_cal.core.display_text import replace_control_characters
+from minimax_cal.core.errors import CalibrationError, OptionError
+from minimax_cal.core.tables import Table
+from minimax_cal.modelling.effects.effect_names import format_budget_step, format_effect
 from minimax_cal.modelling.simulate import simulate
 from minimax_cal.reporting.html import (
-    Figure,
-    Section,
-    View,
-    Wording,
-    compose,
-    page,
-    pdf,
-    read_sources,
+    ChartBlock,
+    ReportRequest,
+    ReportSection,
+    View3dBlock,
+    browser_print,
+    build_report,
+    html_page,
+    read_report_sources,
 )
-from minimax_cal.reporting.html.charts import PALETTE
-from minimax_cal.reporting.html.content import label, some
-from minimax_cal.reporting.html.error_charts import box, cumulative, trend
-from minimax_cal.reporting.html.page import script_json
-from minimax_cal.reporting.html.projection import flat
-from minimax_cal.reporting.html.scene import inside, magnification, skeleton, space_of
-from minimax_cal.reporting.html.sources import Sources
+from minimax_cal.reporting.html.chart_parts import PALETTE_COLOUR_NAMES
+from minimax_cal.reporting.html.error_charts import (
+    build_box_trace,
+    build_cumulative_error_chart,
+    running_median,
+)
+from minimax_cal.reporting.html.html_page import format_script_json
+from minimax_cal.reporting.html.report_content import escape_figure_label, select_drawn_indices
+from minimax_cal.reporting.html.report_sources import ReportSources
+from minimax_cal.reporting.html.workspace_svg import project_to_plane
+from minimax_cal.reporting.html.workspace_view import (
+    arm_polylines,
+    build_drawn_workspace,
+    choose_magnification,
+    clip_tracker_to_workspace,
+)
 from minimax_cal.solvers.status import Status
 
 SECTIONS = [
@@ -58,7 +67,7 @@ SECTIONS = [
 ]  # fmt: skip
 PAGES = SECTIONS[:4]
 NASTY = '<script>alert(1)</script>&amp;"\u2028</script><img src=x onerror=alert(2)>'
-WORDING = Wording("2026-11-21", author="A. Smith", customer="Example Ltd", appendix=True)
+WORDING = ReportRequest("2026-11-21", author="A. Smith", customer="Example Ltd", appendix=True)
 
 
 @pytest.fixture
@@ -76,18 +85,18 @@ def gap(results: Path) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="session")
-def sources(results: Path) -> Sources:
-    return read_sources([results / "fit.json", results / "gap.json"])
+def sources(results: Path) -> ReportSources:
+    return read_report_sources([results / "fit.json", results / "gap.json"])
 
 
 @pytest.fixture(scope="session")
-def sections(sources: Sources) -> dict[str, Section]:
-    return {section.name: section for section in compose(sources, WORDING).sections}
+def sections(sources: ReportSources) -> dict[str, ReportSection]:
+    return {section.name: section for section in build_report(sources, WORDING).sections}
 
 
 @pytest.fixture(scope="session")
-def seen(sources: Sources) -> "Seen":
-    return Seen(page.render(compose(sources, WORDING)))
+def seen(sources: ReportSources) -> "Seen":
+    return Seen(html_page.render_html(build_report(sources, WORDING)))
 
 
 class Seen(HTMLParser):
@@ -149,7 +158,7 @@ def write(path: Path, content: object) -> Path:
 
 def rendered(tmp_path: Path, *contents: object) -> Seen:
     paths = [write(tmp_path / f"{i}.json", content) for i, content in enumerate(contents)]
-    return Seen(page.render(compose(read_sources(paths), WORDING)))
+    return Seen(html_page.render_html(build_report(read_report_sources(paths), WORDING)))
 
 
 # ---- what it says ------------------------------------------------------------------------------
@@ -162,8 +171,8 @@ def test_every_section_is_there_in_order(seen):
 
 
 def test_four_pages_and_where_the_rest_is(sources):
-    report = compose(sources, replace(WORDING, appendix=False))
-    seen = Seen(page.render(report))
+    report = build_report(sources, replace(WORDING, appendix=False))
+    seen = Seen(html_page.render_html(report))
     assert [name for name in seen.text if name != "signatures"] == PAGES
     assert all(section.sheet for section in report.sections)
     assert "its appendix, which has: How large the errors are; What" in seen.text[PAGES[-1]]
@@ -171,11 +180,11 @@ def test_four_pages_and_where_the_rest_is(sources):
 
 def test_nothing_is_lost_and_no_table_stands_twice(sources):
     """Every table of both results is on a page or in the appendix, once."""
-    every = [b for part in compose(sources, WORDING).sections for b in part.blocks]
-    shown = [(b.title, b.cells()) for b in every if isinstance(b, Table)]
+    every = [b for part in build_report(sources, WORDING).sections for b in part.blocks]
+    shown = [(b.title, b.formatted_cells()) for b in every if isinstance(b, Table)]
     for result in (sources.fit, sources.gap):
         for table in result.tables():
-            assert shown.count((table.title, table.cells())) == 1, table.title
+            assert shown.count((table.title, table.formatted_cells())) == 1, table.title
     assert len(shown) == len({title + str(cells) for title, cells in shown})
 
 
@@ -187,7 +196,7 @@ def table_of(seen: Seen, words: str) -> list[list[str]]:
 def test_accuracy_is_that_of_the_calibration(results, seen):
     own = mc.calibrate("ur10", mc.read_measurements(results / "poses.csv")).accuracy_table()
     found = table_of(seen, "position accuracy")
-    assert found == [list(own.header), *own.cells()]
+    assert found == [list(own.header), *own.formatted_cells()]
     assert {"count", "RMS mm", "mean mm", "max mm", "smr1 RMS mm", "smr3 RMS mm"} <= set(found[0])
     crossed = ["cross-validated, nominal", "cross-validated, calibrated"]
     assert [row[0] for row in found[1:4]] == [*crossed, "held out, nominal"]
@@ -219,14 +228,16 @@ def test_diagnosis_is_that_of_the_file(gap, seen):
         places = sum(reason in seen.text[page] for page in ("verdict", "budget"))
         assert places == (0 if reason.startswith("Outside") else 1), reason  # once, of the file
     ladder = table_of(seen, ": error budget, step by step")[1:]
-    assert [row[0] for row in ladder[:-1]] == [name_step(r["step"]) for r in gap["gap"]["ladder"]]
+    assert [row[0] for row in ladder[:-1]] == [
+        format_budget_step(r["step"]) for r in gap["gap"]["ladder"]
+    ]
     for row, rung in zip(ladder, gap["gap"]["ladder"], strict=False):
         numbers = [rung[p][k] for p in ("train", "holdout") for k in ("rms_mm", "max_mm")]
         assert row[1:] == [f"{value:.4f}" for value in numbers]
     assert ladder[-1][1] == f"{gap['gap']['noise_floor_mm']:.4f}"
     effects = table_of(seen, "effects found")[1:]
     assert [row[0] for row in effects] == [
-        name_effect(e["effect"], e["place"]) for e in gap["effects"]
+        format_effect(e["effect"], e["place"]) for e in gap["effects"]
     ]
     assert [row[3:5] for row in effects] == [
         [f"{e['holdout_rms_mm'][k]:.4f}" for k in ("before", "after")] for e in gap["effects"]
@@ -296,7 +307,9 @@ def test_what_later_files_tell_is_shown(tmp_path, fit, gap):
     ("given", "lacking"), [("fit.json", "diagnosis-tables"), ("gap.json", "solution")]
 )
 def test_no_chapter_is_empty(results, given, lacking):
-    seen = Seen(page.render(compose(read_sources([results / given]), WORDING)))
+    seen = Seen(
+        html_page.render_html(build_report(read_report_sources([results / given]), WORDING))
+    )
     told = [name for name in seen.text if name != "signatures"]
     assert told == [name for name in SECTIONS if name in told]
     assert lacking not in told
@@ -325,15 +338,17 @@ def test_a_fit_that_did_not_converge_warns(tmp_path, fit):
 def test_nothing_held_out_is_said(tmp_path, results):
     data = mc.read_measurements(results / "poses.csv")
     mc.calibrate("ur10", data, holdout=0.0).save(tmp_path / "all.json")
-    seen = Seen(page.render(compose(read_sources([tmp_path / "all.json"]), WORDING)))
+    seen = Seen(
+        html_page.render_html(build_report(read_report_sources([tmp_path / "all.json"]), WORDING))
+    )
     assert "No pose was held out" in seen.text["verdict"]
 
 
 # ---- the numbers of the figures ----------------------------------------------------------------
 
 
-def figures(sections: dict[str, Section]) -> list[Figure]:
-    return [b for section in sections.values() for b in section.blocks if isinstance(b, Figure)]
+def figures(sections: dict[str, ReportSection]) -> list[ChartBlock]:
+    return [b for section in sections.values() for b in section.blocks if isinstance(b, ChartBlock)]
 
 
 def painted(value: Any, key: str = "") -> Any:
@@ -343,7 +358,7 @@ def painted(value: Any, key: str = "") -> Any:
     if isinstance(value, list | tuple):
         return [painted(part, key) for part in value]
     is_colour = isinstance(value, str) and key.endswith(("color", "colorscale"))
-    return "#123456" if is_colour and value in PALETTE else value
+    return "#123456" if is_colour and value in PALETTE_COLOUR_NAMES else value
 
 
 def test_figures_are_what_plotly_understands(sections):
@@ -358,8 +373,8 @@ def test_figures_are_what_plotly_understands(sections):
 
 def test_distributions_are_those_of_the_points(sources):
     poses = sources.poses
-    held = np.linalg.norm(poses.after, axis=-1)[:, poses.held]
-    curve = cumulative(poses, ("nominal", "calibrated")).traces[1]
+    held = np.linalg.norm(poses.after, axis=-1)[poses.held]
+    curve = build_cumulative_error_chart(poses, ("nominal", "calibrated")).traces[1]
     for x, y in zip(curve["x"], curve["y"], strict=True):
         assert 100.0 * (held <= x * (1 + 1e-5)).mean() == pytest.approx(y, abs=1e-4)
     assert curve["x"][-1] == pytest.approx(held.max(), rel=1e-5)
@@ -369,7 +384,7 @@ def test_boxes_are_quartiles(rng):
     values = rng.exponential(size=(2, 40))
     values[0, 3] = np.nan
     values = np.vstack([values, np.full(40, np.nan)])  # a target that was never seen
-    drawn = box("after", "calibrated", ["one", "two", "three"], values, panel=0)
+    drawn = build_box_trace("after", "calibrated", ["one", "two", "three"], values.T, panel_index=0)
     assert drawn["x"] == ["one", "two"]
     parts = [drawn[key] for key in ("lowerfence", "q1", "median", "q3", "upperfence")]
     assert_allclose(parts, np.nanpercentile(values[:2], [0, 25, 50, 75, 100], axis=1), rtol=1e-5)
@@ -382,7 +397,7 @@ def test_boxes_are_quartiles(rng):
 def test_the_arm_ends_at_the_flange(name, rng):
     robot = mc.load_robot(name)
     q = rng.uniform(-2, 2, size=(7, robot.joints))
-    arm, corners = skeleton(robot, q)
+    arm, corners = arm_polylines(robot, q)
     assert_allclose(arm[:, 0], 0.0)
     assert_allclose(arm[:, -1], 1e3 * robot.pose(q)[:, :3, 3], atol=1e-9)
     lengths = np.linalg.norm(np.diff(arm, axis=1), axis=-1)
@@ -395,25 +410,28 @@ def test_the_arm_ends_at_the_flange(name, rng):
 
 def test_arrows_lead_from_prediction_to_measurement(sources):
     poses, cell = sources.poses, sources.cell
-    space = space_of(poses, cell)
+    space = build_drawn_workspace(poses, cell)
     predicted = space.points - space.after
-    flange = cell.robot.pose(poses.data.q[space.chosen])
+    flange = cell.robot.pose(poses.data.q[space.pose_indices])
     spots = (
         np.einsum("mij,kj->mki", flange[:, :3, :3], cell.target_positions) + flange[:, None, :3, 3]
     )
     assert_allclose(predicted, 1e3 * spots, atol=1e-6)
     tracker = np.linalg.solve(cell.base, [0, 0, 0, 1])[:3]  # origin of the measurement frame
-    assert space.away == pytest.approx(1e3 * np.linalg.norm(tracker))
+    assert space.tracker_distance == pytest.approx(1e3 * np.linalg.norm(tracker))
     off = np.cross(space.tracker - space.centre, 1e3 * tracker - space.centre)
     assert_allclose(off / space.radius**2, 0.0, atol=1e-9)  # in the true direction
-    assert np.all(np.abs(inside(space) - space.centre) <= 0.8 * (space.high - space.low) + 1e3)
-    times = magnification(space, space.after)
+    assert np.all(
+        np.abs(clip_tracker_to_workspace(space) - space.centre)
+        <= 0.8 * (space.high - space.low) + 1e3
+    )
+    times = choose_magnification(space, space.after)
     sizes = times * np.linalg.norm(space.after, axis=-1)
     assert 0.03 < np.percentile(sizes, 90) / space.radius < 0.13
 
 
 def test_view_holds_every_arrow_once(sections, fit):
-    view = next(b for b in sections["where"].blocks if isinstance(b, View))
+    view = next(b for b in sections["where"].blocks if isinstance(b, View3dBlock))
     rows = fit["poses"]["measured_mm"]
     count = sum(spot[0] is not None for pose in rows for spot in pose)
     for key in ("points", "before", "after"):
@@ -429,13 +447,13 @@ def test_view_holds_every_arrow_once(sections, fit):
 def test_many_poses_are_capped_and_that_is_said(tmp_path):
     made = simulate(mc.load_robot("ur10"), 700, 1, seed=2)
     mc.calibrate("ur10", made.data).save(tmp_path / "many.json")
-    report = compose(read_sources([tmp_path / "many.json"]), WORDING)
+    report = build_report(read_report_sources([tmp_path / "many.json"]), WORDING)
     found = {f.name: f for f in figures({s.name: s for s in report.sections})}
     for name in ("workspace", "joints", "order"):
         assert "500 of 700 poses are drawn" in found[name].says
     drawn = sum(len(t["x"]) for t in found["order"].traces if t["mode"] == "markers")
     assert drawn == 2 * 500
-    assert len(page.render(report)) < 4e6
+    assert len(html_page.render_html(report)) < 4e6
 
 
 # ---- nothing but text --------------------------------------------------------------------------
@@ -480,13 +498,15 @@ def test_hostile_names_are_text(tmp_path, fit, gap):
     fit["parameters"][0]["identifiable"] = False
     fit["minimax"]["trace"][0]["backend"] = NASTY
     seen = rendered(tmp_path, fit, gap)
-    plain = Seen(page.render(compose(read_sources([tmp_path / "0.json"]), WORDING)))
+    plain = Seen(
+        html_page.render_html(build_report(read_report_sources([tmp_path / "0.json"]), WORDING))
+    )
     assert "img" not in seen.tags
     assert not [name for _, name, _ in seen.attributes if name.startswith("on")]
     kinds = [attributes.get("type") for attributes, _ in seen.scripts]
     assert kinds.count("application/json") == len(kinds) - 2  # figures, plotly, the page's own
     assert kinds.count(None) == plain.tags.count("body") == 1
-    text = visible(NASTY)
+    text = replace_control_characters(NASTY)
     for name in ("verdict", "provenance", "diagnosis-tables", "solution", "parameters"):
         assert text in seen.text[name]
     assert seen.tables["Files"][2][1] == text
@@ -494,7 +514,7 @@ def test_hostile_names_are_text(tmp_path, fit, gap):
 
 def test_labels_of_figures_hold_no_marks(tmp_path, fit, gap):
     paths = [write(tmp_path / "0.json", hostile(fit)), write(tmp_path / "1.json", hostile(gap))]
-    report = compose(read_sources(paths), WORDING)
+    report = build_report(read_report_sources(paths), WORDING)
 
     def texts(value: Any) -> list[str]:
         if isinstance(value, dict):
@@ -512,9 +532,9 @@ def test_labels_of_figures_hold_no_marks(tmp_path, fit, gap):
 @given(st.text(max_size=60))
 @settings(max_examples=50)
 def test_label_comes_back_from_its_marks(text):
-    assert html.unescape(label(text)) == html.unescape(html.escape(text, quote=False))
-    assert not {"<", ">"} & set(label(text))
-    assert len(html.unescape(label(text * 50))) <= 70
+    assert html.unescape(escape_figure_label(text)) == html.unescape(html.escape(text, quote=False))
+    assert not {"<", ">"} & set(escape_figure_label(text))
+    assert len(html.unescape(escape_figure_label(text * 50))) <= 70
 
 
 JSON = st.recursive(
@@ -527,7 +547,7 @@ JSON = st.recursive(
 
 @given(JSON)
 def test_json_in_a_script_cannot_end_it(content):
-    text = script_json(content)
+    text = format_script_json(content)
     assert json.loads(text) == content
     assert not set("<>&\u2028\u2029") & set(text)
 
@@ -535,15 +555,15 @@ def test_json_in_a_script_cannot_end_it(content):
 @given(st.text())
 @settings(max_examples=200)
 def test_what_is_shown_can_be_written_and_hides_nothing(text):
-    shown = visible(text)
+    shown = replace_control_characters(text)
     shown.encode()  # no lone surrogates
     assert len(shown) == len(text)
-    assert visible(shown) == shown
+    assert replace_control_characters(shown) == shown
     assert not set("\u202e\u2066\x00\x1b\n") & set(shown)
 
 
 def test_nothing_leads_outside(seen, sources):
-    text = page.render(compose(sources, WORDING))
+    text = html_page.render_html(build_report(sources, WORDING))
     clear = re.sub(r'(id="plotly">)[A-Za-z0-9+/=]+', r"\1", text)
     assert len(clear) < 0.4 * len(text)
     for word in ("http:", "https:", "://", "url(",
@@ -610,21 +630,21 @@ def test_the_same_files_give_the_same_page(results, tmp_path, monkeypatch):
 def test_files_must_belong_together(results, tmp_path, fit, gap):
     one, other = results / "fit.json", results / "gap.json"
     with pytest.raises(CalibrationError, match="second calibration"):
-        read_sources([one, one])
+        read_report_sources([one, one])
     with pytest.raises(CalibrationError, match="second calibration"):
-        read_sources([one, other, one])
+        read_report_sources([one, other, one])
     with pytest.raises(CalibrationError, match="one to three files"):
-        read_sources([])
+        read_report_sources([])
     with pytest.raises(CalibrationError, match="neither a calibration nor a diagnosis"):
-        read_sources([write(tmp_path / "a.json", {"kind": "evaluation"})])
+        read_report_sources([write(tmp_path / "a.json", {"kind": "evaluation"})])
     changed = copy.deepcopy(gap)
     changed["provenance"]["data_sha256"] = "0" * 64
     with pytest.raises(CalibrationError, match="different measurements"):
-        read_sources([one, write(tmp_path / "a.json", changed)])
-    assert read_sources([other, one]).notices == ()
+        read_report_sources([one, write(tmp_path / "a.json", changed)])
+    assert read_report_sources([other, one]).notices == ()
     gap["poses"]["split"] = gap["poses"]["split"][::-1]
     gap["robot"] = "another"
-    told = read_sources([one, write(tmp_path / "a.json", gap)]).notices
+    told = read_report_sources([one, write(tmp_path / "a.json", gap)]).notices
     assert len(told) == 2
     assert "another" in told[0]
     assert "held out different poses" in told[1]
@@ -676,7 +696,7 @@ def test_no_slip_in_a_file_is_a_traceback(name, slips, results, tmp_path):
     for _ in range(slips):
         path = write(tmp_path / "slip.json", slipped(whole, rng, odd, 0.0))
         with suppress(CalibrationError):
-            compose(read_sources([path]), WORDING)
+            build_report(read_report_sources([path]), WORDING)
 
 
 def test_what_is_not_installed_is_said(sources, monkeypatch, tmp_path, results):
@@ -686,12 +706,12 @@ def test_what_is_not_installed_is_said(sources, monkeypatch, tmp_path, results):
     assert list(tmp_path.iterdir()) == []  # before any work
     monkeypatch.setitem(sys.modules, "plotly.offline", None)
     with pytest.raises(OptionError, match=r"in a clone of the repository"):
-        page.render(compose(sources, WORDING))
+        html_page.render_html(build_report(sources, WORDING))
 
 
 def test_a_browser_that_fails_leaves_no_pdf(tmp_path):
     with pytest.raises(CalibrationError, match="could not print it"):
-        pdf.print_pdf("<p>", tmp_path / "a.pdf", "/bin/false")
+        browser_print.write_pdf("<p>", tmp_path / "a.pdf", "/bin/false")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -724,14 +744,18 @@ def test_real_arm_in_three_commands(tmp_path, capsys):
 
 def test_trend_is_a_running_median():
     x = np.arange(60.0)[::-1]
-    at, middle = trend(x, 3.0 * x)
+    at, middle = running_median(x, 3.0 * x)
     assert len(at) == 12
     assert_allclose(middle, 3.0 * at)
     assert np.all(np.diff(at) > 0)
 
 
 def test_still_is_a_parallel_projection():
-    right, up, depth = flat(np.eye(3)).T[0], -flat(np.eye(3)).T[1], np.zeros(3)
+    right, up, depth = (
+        project_to_plane(np.eye(3)).T[0],
+        -project_to_plane(np.eye(3)).T[1],
+        np.zeros(3),
+    )
     depth = np.cross(right, up)
     assert_allclose(np.stack([right, up, depth]) @ np.stack([right, up, depth]).T, np.eye(3),
                     atol=1e-12)  # fmt: skip
@@ -740,7 +764,7 @@ def test_still_is_a_parallel_projection():
 
 @given(st.lists(st.floats(0, 1e3), max_size=60), st.integers(4, 20))
 def test_some_keeps_the_largest(size, most):
-    chosen = some(np.array(size), most)
+    chosen = select_drawn_indices(np.array(size), most)
     assert len(chosen) == min(most, len(size))
     assert np.all(np.diff(chosen) > 0)
     if size:

@@ -13,13 +13,13 @@ import pytest
 from conftest import run
 from test_report import NASTY, WORDING, hostile, write
 
-from experiments.relative_gap import Job, arm_of, seen
-from minimax_cal.diagnosing.instruments import diagnose_relative
-from minimax_cal.ground.tables import Table
-from minimax_cal.ground.words import visible
-from minimax_cal.judging.tolerance import limits_of
-from minimax_cal.reporting.html import compose, read_sources, render
-from minimax_cal.reporting.html.content import Figure
+from experiments.relative_gap import RelativeGapJob, draw_arm, simulate_instrument
+from minimax_cal.core.display_text import replace_control_characters
+from minimax_cal.core.tables import Table
+from minimax_cal.diagnosing.diagnose_instruments import diagnose_relative
+from minimax_cal.reporting.html import build_report, read_report_sources, render_html
+from minimax_cal.reporting.html.report_content import ChartBlock
+from minimax_cal.validation.tolerance import parse_limits
 
 A4 = (680, 993)  # pixels between the margins
 PATIENCE = 120.0  # seconds; drawing by software on a busy machine is slow
@@ -32,7 +32,9 @@ def folder(results: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     files = [results / name for name in ("fit.json", "gap.json")]
     bad = [write(out / path.name, hostile(json.loads(path.read_text()))) for path in files]
     for name, paths in (("good", files), ("bad", bad)):
-        (out / f"{name}.html").write_text(render(compose(read_sources(paths), WORDING)))
+        (out / f"{name}.html").write_text(
+            render_html(build_report(read_report_sources(paths), WORDING))
+        )
     return out
 
 
@@ -86,21 +88,21 @@ def test_opens_without_a_complaint_and_asks_for_nothing(opened, folder):
 @pytest.mark.dev
 def test_every_section_shows_the_numbers_of_the_files(opened, results):
     files = [results / name for name in ("fit.json", "gap.json")]
-    for section in compose(read_sources(files), WORDING).sections:
+    for section in build_report(read_report_sources(files), WORDING).sections:
         rows = opened.execute_script(
             "return [...document.getElementById(arguments[0]).querySelectorAll('table')].map(t => "
             "[t.caption.textContent, [...t.rows].map(r => [...r.cells].map(c => c.textContent))])",
             section.name,
         )
         own = [block for block in section.blocks if isinstance(block, Table)]
-        assert rows == [[t.title, [list(t.header), *t.cells()]] for t in own]
+        assert rows == [[t.title, [list(t.header), *t.formatted_cells()]] for t in own]
 
 
 @pytest.mark.dev
 def test_every_chart_is_drawn(opened, results):
     files = [results / name for name in ("fit.json", "gap.json")]
-    report = compose(read_sources(files), WORDING)
-    names = [b.name for s in report.sections for b in s.blocks if isinstance(b, Figure)]
+    report = build_report(read_report_sources(files), WORDING)
+    names = [b.name for s in report.sections for b in s.blocks if isinstance(b, ChartBlock)]
     assert len(names) >= 8
     for name in names:
         marks, wide = opened.execute_script(
@@ -234,12 +236,12 @@ def test_the_page_itself_forbids_scripts_and_requests(opened):
 @pytest.mark.dev
 def test_the_first_page_is_one_sheet_with_all_that_is_signed(driver, results, tmp_path):
     """On A4: robot, verdict, cause, results, picture and signatures, and nothing else."""
-    limits = limits_of("rms 0.2, max 0.5")
+    limits = parse_limits("rms 0.2, max 0.5")
     facts = {"serial_number": "26-104711", "tool": "three-ball nest, " * 4}
     wording = replace(WORDING, limits=limits, facts=facts)
-    sources = read_sources([results / "fit.json", results / "gap.json"])
+    sources = read_report_sources([results / "fit.json", results / "gap.json"])
     path = tmp_path / "page.html"
-    path.write_text(render(compose(sources, wording)))
+    path.write_text(render_html(build_report(sources, wording)))
     open_page(driver, path)
     size = {"width": A4[0], "height": A4[1], "deviceScaleFactor": 1, "mobile": False}
     driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
@@ -282,7 +284,7 @@ def test_hostile_names_are_shown_and_do_nothing(driver, folder):
         assert driver.switch_to.alert
     assert [e for e in driver.get_log("browser") if e["level"] == "SEVERE"] == []
     assert not [url for url in sent(driver)[1:] if not url.startswith(("data:", "blob:"))]
-    text = visible(NASTY)
+    text = replace_control_characters(NASTY)
     assert text in driver.execute_script("return document.querySelector('h1').textContent")
     assert driver.execute_script("return document.images.length") == 0
     labels = driver.execute_script(
@@ -338,11 +340,13 @@ def test_pdf_holds_the_whole_report(results, tmp_path):
 
 @pytest.mark.dev
 def test_a_diagnosis_of_several_instruments_is_shown(driver, tmp_path):
-    job = Job("irb2600", ("wires_3", "tracker"), "compliance", 1, 80)
-    arm, rng = arm_of(job), np.random.default_rng(4)
-    found = diagnose_relative(arm.robot, [seen(arm, k, 80, rng) for k in job.instruments])
+    job = RelativeGapJob("irb2600", ("wires_3", "tracker"), "compliance", 1, 80)
+    arm, rng = draw_arm(job), np.random.default_rng(4)
+    found = diagnose_relative(
+        arm.robot, [simulate_instrument(arm, k, 80, rng) for k in job.instruments]
+    )
     path = tmp_path / "relative.html"
-    path.write_text(render(compose(read_sources([found]), WORDING)))
+    path.write_text(render_html(build_report(read_report_sources([found]), WORDING)))
     open_page(driver, path)
     assert [e for e in driver.get_log("browser") if e["level"] == "SEVERE"] == []
     text = driver.execute_script("return document.body.innerText")

@@ -7,16 +7,23 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
-from minimax_cal.modelling.cell import still
+from minimax_cal.modelling.cell import build_measurements_at_rest
 from minimax_cal.modelling.effects.table import Fitted, Term
-from minimax_cal.modelling.model import Model, arrays_of, model_of
-from minimax_cal.modelling.parameters import State
-from minimax_cal.modelling.reach import arm_of
-from minimax_cal.modelling.reach import bent as reached_at
+from minimax_cal.modelling.inverse_with_effects import build_flange_cell
+from minimax_cal.modelling.inverse_with_effects import (
+    effect_joint_shifts_and_flange_motions as reached_at,
+)
+from minimax_cal.modelling.parameters import ParameterValues
+from minimax_cal.modelling.point_model import PointModel, build_point_model, to_kernel_state
 from minimax_cal.robots import kinematics
-from minimax_cal.robots.kernels import choice, plain, sums
-from minimax_cal.robots.sampling import random_poses
-from minimax_cal.robots.transforms import CONVENTION, Frame, frames_tables, transform
+from minimax_cal.robots.joint_sampling import random_joint_values_above_floor
+from minimax_cal.robots.kernels import kernel_choice, plain, pose_sums
+from minimax_cal.robots.transforms import (
+    ABC_ANGLES_CONVENTION,
+    Frame,
+    build_frame_tables,
+    build_transform,
+)
 
 # ---- kinematics ----------------------------------------------------------------------------------
 
@@ -35,19 +42,21 @@ def test_jacobian_is_the_complex_step_derivative(name, rng):
     n = robot.joints
     q = rng.uniform(-2, 2, (20, n))
     data = mc.measurements(q, rng.normal(size=(20, 3, 3)))
-    model = model_of(robot, data)
-    turn = kinematics.rotation(rng.normal(size=3))
-    state = State(bent(robot, rng), turn, rng.normal(size=3), TARGETS)
-    analytic = model.jacobian(state)
-    for i in range(model.names.count):
-        dx = np.zeros(model.names.count, dtype=complex)
+    model = build_point_model(robot, data)
+    turn = kinematics.rotation_from_vector(rng.normal(size=3))
+    state = ParameterValues(bent(robot, rng), turn, rng.normal(size=3), TARGETS)
+    analytic = model.point_jacobian(state)
+    for i in range(model.names.parameter_count):
+        dx = np.zeros(model.names.parameter_count, dtype=complex)
         dx[i] = 1e-30j  # exact to rounding: no difference is taken
         moved = state.step(dx)
-        links = kinematics.chain(moved.mdh, model.q, model.prismatic)
-        point = np.moveaxis(kinematics.points(links, moved.target_positions), -1, 0)
+        links = kinematics.compute_link_frames(moved.mdh, model.q, model.prismatic)
+        point = np.moveaxis(kinematics.targets_in_base(links, moved.target_positions), -1, 0)
         seen = point @ moved.rotation.T + moved.origin
         slope = (seen.imag / 1e-30) @ state.rotation  # from measurement into base axes
-        assert_allclose(analytic[..., i], slope, rtol=0, atol=1e-14, err_msg=model.names.all[i])
+        assert_allclose(
+            analytic[..., i], slope, rtol=0, atol=1e-14, err_msg=model.names.all_names[i]
+        )
 
 
 def pinocchio_model(robot: mc.Robot):
@@ -86,9 +95,11 @@ def test_forward_agrees_with_pinocchio(name, rng):
 def test_batched_chain_equals_each_alone(robot, rng):
     mdh = np.stack([bent(robot, rng) for _ in range(4)])
     q = rng.uniform(-3, 3, (7, 6))
-    together = kinematics.forward(mdh, q, robot.prismatic)
+    together = kinematics.forward_kinematics(mdh, q, robot.prismatic)
     for one, alone in zip(mdh, together, strict=True):
-        assert_allclose(kinematics.forward(one, q, robot.prismatic), alone, rtol=0, atol=1e-15)
+        assert_allclose(
+            kinematics.forward_kinematics(one, q, robot.prismatic), alone, rtol=0, atol=1e-15
+        )
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-12, 1e-5, 1.0, 3.1])
@@ -98,7 +109,7 @@ def test_rotation_is_scipys(size, rng):
     w = rng.normal(size=3)
     w *= size / np.linalg.norm(w)
     expected = Rotation.from_rotvec(w).as_matrix()
-    assert_allclose(kinematics.rotation(w), expected, rtol=0, atol=1e-15)
+    assert_allclose(kinematics.rotation_from_vector(w), expected, rtol=0, atol=1e-15)
 
 
 # ---- kernels -------------------------------------------------------------------------------------
@@ -117,12 +128,14 @@ def fast() -> ModuleType:
     return fast
 
 
-def cell(name: str, robots: int, effects: int, rng: np.random.Generator) -> tuple[Model, State]:
+def cell(
+    name: str, robots: int, effects: int, rng: np.random.Generator
+) -> tuple[PointModel, ParameterValues]:
     """An arm amid measurements with holes and weights, and a batch of states near the truth."""
     sim = mc.simulate(mc.load_robot(name), POSES, 2, 0)
     y = sim.data.y.copy()
     y[rng.random(y.shape[:2]) < 0.2] = np.nan
-    model = model_of(sim.cell.robot, sim.data.with_y(y))
+    model = build_point_model(sim.cell.robot, sim.data.with_y(y))
     fields, moved = (
         1e-3 * rng.normal(size=(effects, *model.y.shape)),
         1e-4 * rng.normal(size=model.y.shape),
@@ -130,11 +143,11 @@ def cell(name: str, robots: int, effects: int, rng: np.random.Generator) -> tupl
     weight = model.weight * rng.uniform(0.5, 2.0, model.weight.shape)
     names = replace(model.names, effects=tuple(f"e{i}" for i in range(effects)))
     model = replace(
-        model, names=names, weight=weight, active=np.ones(names.count, dtype=bool),
+        model, names=names, weight=weight, active=np.ones(names.parameter_count, dtype=bool),
         fields=fields if effects else model.fields, moved=moved if effects else model.moved,
     )  # fmt: skip
-    begin = replace(sim.cell.state, effects=np.zeros(effects)).repeat(robots)
-    return model, begin.step(1e-3 * rng.normal(size=(robots, names.count)))
+    begin = replace(sim.cell.parameter_values, effects=np.zeros(effects)).repeat(robots)
+    return model, begin.step(1e-3 * rng.normal(size=(robots, names.parameter_count)))
 
 
 CELLS = [("irb120", 1, 0), ("irb2600", 3, 2), ("scara_600", 2, 0), ("scara_600", 1, 3)]
@@ -149,21 +162,42 @@ def near(found: Arrays, wanted: Arrays, alike: float = ALIKE) -> None:
 @pytest.mark.parametrize(("name", "robots", "effects"), CELLS)
 def test_pairs(name, robots, effects, fast, rng):
     model, state = cell(name, robots, effects, rng)
-    at, seen = arrays_of(state), model.sight
+    at, seen = to_kernel_state(state), model.kernel_data
     (mdh, *place), (q, prismatic, *_) = at, seen
-    near(fast.chain(mdh, q, prismatic), plain.chain(mdh, q, prismatic))
-    arm = plain.unwound(mdh, q, prismatic, 20, 90)
-    near((fast.unwound(mdh, q, prismatic, 20, 90),), (arm,))
-    near(fast.sighted(arm, *place, *seen[2:], 20), plain.sighted(arm, *place, *seen[2:], 20))
-    near((sums.cost(fast, at, seen),), (sums.cost(plain, at, seen),))
+    near(
+        fast.link_axes_and_origins(mdh, q, prismatic),
+        plain.link_axes_and_origins(mdh, q, prismatic),
+    )
+    arm = plain.link_frames_in_flange(mdh, q, prismatic, 20, 90)
+    near((fast.link_frames_in_flange(mdh, q, prismatic, 20, 90),), (arm,))
+    near(
+        fast.weighted_target_errors(arm, *place, *seen[2:], 20),
+        plain.weighted_target_errors(arm, *place, *seen[2:], 20),
+    )
+    near(
+        (pose_sums.sum_target_costs(fast, at, seen),),
+        (pose_sums.sum_target_costs(plain, at, seen),),
+    )
     one = tuple(part[:1] for part in at)
     for share in (1.0, 0.6):
-        which = np.flatnonzero(rng.random(model.names.count) < share)
+        which = np.flatnonzero(rng.random(model.names.parameter_count) < share)
         step = 1e-2 * rng.normal(size=len(which))
-        near(sums.normal(fast, at, seen, which), sums.normal(plain, at, seen, which))
-        near(sums.rows(fast, one, seen, which, 20, 90), sums.rows(plain, one, seen, which, 20, 90))
-        near(sums.squares(fast, one, seen, which), sums.squares(plain, one, seen, which))
-        near(fast.stepped(*one, which, step), plain.stepped(*one, which, step))
+        near(
+            pose_sums.sum_normal_equations(fast, at, seen, which),
+            pose_sums.sum_normal_equations(plain, at, seen, which),
+        )
+        near(
+            pose_sums.weighted_errors_and_jacobian(fast, one, seen, which, 20, 90),
+            pose_sums.weighted_errors_and_jacobian(plain, one, seen, which, 20, 90),
+        )
+        near(
+            pose_sums.squared_distances_and_gradients(fast, one, seen, which),
+            pose_sums.squared_distances_and_gradients(plain, one, seen, which),
+        )
+        near(
+            fast.apply_parameter_step(*one, which, step),
+            plain.apply_parameter_step(*one, which, step),
+        )
 
 
 def test_a_system_that_is_not_definite_is_told(fast, rng):
@@ -173,7 +207,7 @@ def test_a_system_that_is_not_definite_is_told(fast, rng):
     for hold in (np.zeros(6), rng.uniform(size=6)):
         gram = np.swapaxes(rows, 2, 3) @ rows
         given = rng.uniform(size=(1, 3)), right, gram, off, hold
-        found, wanted = fast.solved(*given), plain.solved(*given)
+        found, wanted = fast.solve_gauss_newton_step(*given), plain.solve_gauss_newton_step(*given)
         assert_allclose(found[0], wanted[0], rtol=1e-11)
         assert_allclose(found[1:3], wanted[1:3], rtol=1e-11)
         assert found[3]
@@ -182,33 +216,35 @@ def test_a_system_that_is_not_definite_is_told(fast, rng):
         assert_allclose(total @ wanted[0], right[0].sum(axis=0) + hold * off, rtol=1e-9)
     rows[..., -1] = rows[..., 0]
     given = given[0], right, np.swapaxes(rows, 2, 3) @ rows, off, np.zeros(6)
-    assert not fast.solved(*given)[3]
-    assert not plain.solved(*given)[3]
+    assert not fast.solve_gauss_newton_step(*given)[3]
+    assert not plain.solve_gauss_newton_step(*given)[3]
 
 
 @pytest.mark.parametrize(("name", "robots", "effects"), CELLS)
 def test_rows_make_the_normal_equations(name, robots, effects, rng):
     model, state = cell(name, 1, effects, rng)
-    which = np.flatnonzero(rng.random(model.names.count) < 0.8)
-    given = plain, arrays_of(state), model.sight, which
-    error, J = sums.rows(*given, 0, POSES)
-    cost, gradient, gram = sums.normal(*given)
+    which = np.flatnonzero(rng.random(model.names.parameter_count) < 0.8)
+    given = plain, to_kernel_state(state), model.kernel_data, which
+    error, J = pose_sums.weighted_errors_and_jacobian(*given, 0, POSES)
+    cost, gradient, gram = pose_sums.sum_normal_equations(*given)
     made = (
         (error**2).sum(axis=(1, 2)),
         np.einsum("kpic,kic->kp", J, error),
         np.einsum("kpic,kqic->kpq", J, J),
     )
     near(made, (cost[0], gradient[0], gram[0]))
-    f, slope = sums.squares(*given)
+    f, slope = pose_sums.squared_distances_and_gradients(*given)
     near((f.sum(axis=1), slope.sum(axis=1)), (cost[0], -2.0 * gradient[0]))
 
 
 @pytest.mark.parametrize(("name", "robots", "effects"), CELLS)
 def test_normal_equations_are_those_of_the_jacobian(name, robots, effects, rng):
     model, state = cell(name, robots, effects, rng)
-    which = np.flatnonzero(rng.random(model.names.count) < 0.8)
-    cost, gradient, gram = sums.normal(plain, arrays_of(state), model.sight, which)
-    error, J = np.nan_to_num(model.error(state)), model.jacobian(state)[..., which]
+    which = np.flatnonzero(rng.random(model.names.parameter_count) < 0.8)
+    cost, gradient, gram = pose_sums.sum_normal_equations(
+        plain, to_kernel_state(state), model.kernel_data, which
+    )
+    error, J = np.nan_to_num(model.point_errors(state)), model.point_jacobian(state)[..., which]
     weight = model.weight.T[..., None]
     near(
         (cost, gradient, gram),
@@ -218,18 +254,20 @@ def test_normal_equations_are_those_of_the_jacobian(name, robots, effects, rng):
             np.einsum("km,bmkip,bmkiq->bkpq", model.weight, J, J),
         ),
     )
-    near((sums.cost(plain, arrays_of(state), model.sight),), (cost,))
+    near((pose_sums.sum_target_costs(plain, to_kernel_state(state), model.kernel_data),), (cost,))
 
 
 @pytest.mark.parametrize(("name", "effects"), [("irb120", 0), ("irb2600", 2)])
 def test_plain_steps_end_alike(name, effects, fast, rng):
     model, state = cell(name, 1, effects, rng)
     names = ("a1", "a2", "a3", "theta2", "theta3", "theta4", "theta5")
-    told = [model.names.index(one) for one in names]  # by any poses
-    which = np.array([*told, *range(5 * model.names.joints, model.names.count)])
+    told = [model.names.index_of_name(one) for one in names]  # by any poses
+    which = np.array([*told, *range(5 * model.names.joints, model.names.parameter_count)])
     prior = np.full(len(which), 1e-3), np.where(which < 5 * model.names.joints, 1e-3, 0.0)
     ends = [
-        sums.descend(module, arrays_of(state), model.sight, which, prior, 1e-12, 15)
+        pose_sums.descend_by_gauss_newton(
+            module, to_kernel_state(state), model.kernel_data, which, prior, 1e-12, 15
+        )
         for module in (fast, plain)
     ]
     assert ends[0][-1]
@@ -242,8 +280,10 @@ def test_polish(fast, rng):
     truth = Rotation.random(rng=rng).as_matrix()
     matrix = rng.normal(size=(10, 9))
     right = matrix @ truth.reshape(9) + 1e-3 * rng.normal(size=10)
-    starts = np.stack([truth @ plain.turned(0.5 * rng.normal(size=3)) for _ in range(8)])
-    ends = [module.polish(matrix, right, starts) for module in (fast, plain)]
+    starts = np.stack(
+        [truth @ plain.rotation_from_vector(0.5 * rng.normal(size=3)) for _ in range(8)]
+    )
+    ends = [module.refine_rotations(matrix, right, starts) for module in (fast, plain)]
     assert ends[0][1].min() < 1e-5
     near(ends[0], ends[1], alike=1e-9)
     best = ends[1][0][np.argmin(ends[1][1])]
@@ -252,25 +292,25 @@ def test_polish(fast, rng):
 
 
 def test_choice(monkeypatch, fast):
-    choice.best.cache_clear()
-    monkeypatch.setenv(choice.SWITCH, "plain")
-    assert choice.kernels() is plain
-    choice.best.cache_clear()
-    monkeypatch.delenv(choice.SWITCH)
-    assert choice.kernels() is fast
-    with choice.work(brief=True):
-        assert choice.kernels() is plain
-        with choice.work(brief=False):
-            assert choice.kernels() is fast
-    assert choice.kernels() is fast
+    kernel_choice.load_best_kernels.cache_clear()
+    monkeypatch.setenv(kernel_choice.KERNELS_VARIABLE, "plain")
+    assert kernel_choice.active_kernels() is plain
+    kernel_choice.load_best_kernels.cache_clear()
+    monkeypatch.delenv(kernel_choice.KERNELS_VARIABLE)
+    assert kernel_choice.active_kernels() is fast
+    with kernel_choice.use_numpy_kernels_for_brief_work(brief=True):
+        assert kernel_choice.active_kernels() is plain
+        with kernel_choice.use_numpy_kernels_for_brief_work(brief=False):
+            assert kernel_choice.active_kernels() is fast
+    assert kernel_choice.active_kernels() is fast
 
 
 def test_without_numba_numpy_answers(monkeypatch):
-    choice.best.cache_clear()
-    monkeypatch.delenv(choice.SWITCH, raising=False)
-    monkeypatch.setattr(choice.util, "find_spec", lambda name: None)
-    assert choice.kernels() is plain
-    choice.best.cache_clear()
+    kernel_choice.load_best_kernels.cache_clear()
+    monkeypatch.delenv(kernel_choice.KERNELS_VARIABLE, raising=False)
+    monkeypatch.setattr(kernel_choice.util, "find_spec", lambda name: None)
+    assert kernel_choice.active_kernels() is plain
+    kernel_choice.load_best_kernels.cache_clear()
 
 
 def test_where_compiled_kernels_have_no_folder_numpy_answers(monkeypatch, caplog):
@@ -279,23 +319,23 @@ def test_where_compiled_kernels_have_no_folder_numpy_answers(monkeypatch, caplog
     def fail(_: str) -> None:
         raise RuntimeError("cannot cache function 'chain': no locator available")
 
-    choice.best.cache_clear()
-    monkeypatch.delenv(choice.SWITCH, raising=False)
-    monkeypatch.setattr(choice, "import_module", fail)
-    monkeypatch.setattr(choice.util, "find_spec", lambda name: True)
-    assert choice.kernels() is plain
+    kernel_choice.load_best_kernels.cache_clear()
+    monkeypatch.delenv(kernel_choice.KERNELS_VARIABLE, raising=False)
+    monkeypatch.setattr(kernel_choice, "import_module", fail)
+    monkeypatch.setattr(kernel_choice.util, "find_spec", lambda name: True)
+    assert kernel_choice.active_kernels() is plain
     assert "NUMBA_CACHE_DIR" in caplog.text
-    choice.best.cache_clear()
+    kernel_choice.load_best_kernels.cache_clear()
 
 
 @pytest.mark.parametrize("name", ["plain", "fast"])
 def test_targets_alone_may_be_free(name, request, rng):
     own = plain if name == "plain" else request.getfixturevalue(name)
     model, state = cell("irb120", 1, 0, rng)
-    given = plain, arrays_of(state), model.sight
-    first, every = 5 * 6 + 6, np.arange(model.names.count)
-    whole = sums.normal(*given, every)
-    cost, gradient, gram = sums.normal(own, *given[1:], every[first:])
+    given = plain, to_kernel_state(state), model.kernel_data
+    first, every = 5 * 6 + 6, np.arange(model.names.parameter_count)
+    whole = pose_sums.sum_normal_equations(*given, every)
+    cost, gradient, gram = pose_sums.sum_normal_equations(own, *given[1:], every[first:])
     near((cost, gradient, gram), (whole[0], whole[1][..., first:], whole[2][..., first:, first:]))
 
 
@@ -308,7 +348,7 @@ THERE = 1e-7  # of a pose [m, and what turns a point at the lever so far]
 def test_every_robot_comes_back_to_its_pose(rng):
     for name in mc.builtin_robots():
         robot = mc.load_robot(name)
-        q = random_poses(robot, 20, rng, 0.9 * np.pi)
+        q = random_joint_values_above_floor(robot, 20, rng, 0.9 * np.pi)
         near = np.clip(q + 0.05 * rng.normal(size=q.shape), robot.lower, robot.upper)
         if robot.joints < 6:  # a start away from it may choose another of fewer ways
             near = q + 1e-3
@@ -331,7 +371,7 @@ def test_batches_have_the_shape_of_their_poses(robot, rng):
 
 
 def test_without_a_start_any_way_is_found(robot, rng):
-    pose = robot.pose(random_poses(robot, 30, rng))
+    pose = robot.pose(random_joint_values_above_floor(robot, 30, rng))
     q = robot.inverse(pose)
     assert_allclose(robot.pose(q), pose, rtol=0, atol=1e-6)
     assert (q >= robot.lower).all()
@@ -365,13 +405,13 @@ def test_no_pose_is_one_line(robot, pose, near, said):
 def test_a_fit_counts_its_effects(noisy, rng):
     """The flange with its compliance, by the law itself, is at the pose."""
     fit = mc.calibrate("irb2600", noisy.data, "sum", effects="joint_compliance:all")
-    arm, robot = arm_of(fit.cell), fit.cell.robot
-    q = random_poses(robot, 10, rng)
-    turn, moved = reached_at(arm, still(q, arm.target_names, robot))
+    arm, robot = build_flange_cell(fit.cell), fit.cell.robot
+    q = random_joint_values_above_floor(robot, 10, rng)
+    turn, moved = reached_at(arm, build_measurements_at_rest(q, arm.target_names, robot))
     assert np.abs(turn).max() > 1e-4
     pose = moved @ robot.pose(q + turn * robot.sign)
     found = fit.inverse(pose, near=q + 1e-3)
-    turn, moved = reached_at(arm, still(found, arm.target_names, robot))
+    turn, moved = reached_at(arm, build_measurements_at_rest(found, arm.target_names, robot))
     assert_allclose(moved @ robot.pose(found + turn * robot.sign), pose, rtol=0, atol=THERE)
     assert np.abs(robot.pose(robot.inverse(pose, near=q)) - pose).max() < THERE
     assert np.abs(found - robot.inverse(pose, near=found)).max() > 1e-5  # the effects' share
@@ -397,8 +437,8 @@ SPECIAL = Rotation.from_euler(
 
 @pytest.mark.parametrize("turn", [*TURNS, *SPECIAL])
 def test_a_frame_is_what_scipy_says(turn):
-    pose = transform(turn, np.array([0.1, -2.0, 3.0]))
-    frame = Frame.of(pose)
+    pose = build_transform(turn, np.array([0.1, -2.0, 3.0]))
+    frame = Frame.from_pose(pose)
     assert_allclose(frame.pose, pose, rtol=0, atol=1e-14)
     assert_allclose(frame.xyz_mm, [100.0, -2000.0, 3000.0], rtol=1e-15)
     back = Rotation.from_euler("ZYX", frame.abc_deg, degrees=True).as_matrix()
@@ -416,17 +456,19 @@ def test_a_turns_about_z_b_about_y_c_about_x():
     """Each angle alone, by hand: what KUKA calls A, B, C."""
     quarter = {"A": [[0, -1, 0], [1, 0, 0], [0, 0, 1]], "C": [[1, 0, 0], [0, 0, -1], [0, 1, 0]]}
     for name, turn in quarter.items():
-        found = Frame.of(transform(np.array(turn, dtype=float), np.zeros(3))).abc_deg
+        found = Frame.from_pose(build_transform(np.array(turn, dtype=float), np.zeros(3))).abc_deg
         assert_allclose(found, np.array([90.0, 0.0, 0.0] if name == "A" else [0.0, 0.0, 90.0]))
     tilt = np.array([[0, 0, 1], [0, 1, 0], [-1, 0, 0]], dtype=float)
-    assert_allclose(Frame.of(transform(tilt, np.zeros(3))).abc_deg, [0.0, 90.0, 0.0], atol=1e-12)
-    assert "Rz(A) Ry(B) Rx(C)" in CONVENTION
+    assert_allclose(
+        Frame.from_pose(build_transform(tilt, np.zeros(3))).abc_deg, [0.0, 90.0, 0.0], atol=1e-12
+    )
+    assert "Rz(A) Ry(B) Rx(C)" in ABC_ANGLES_CONVENTION
 
 
 def test_tables_hold_every_digit_and_say_the_order():
-    frame = Frame.of(transform(TURNS[0], np.array([0.1, -2.0, 3.0])))
-    places, turns = frames_tables({"base": frame}, "frames")
+    frame = Frame.from_pose(build_transform(TURNS[0], np.array([0.1, -2.0, 3.0])))
+    places, turns = build_frame_tables({"base": frame}, "frames")
     assert places.rows == (("base", *frame.xyz_mm, *frame.abc_deg),)
     assert turns.rows == (("base", *frame.quaternion_wxyz, *frame.rotation_vector_rad),)
-    assert CONVENTION in places.title
-    assert frame.distance_mm == pytest.approx(np.linalg.norm(frame.xyz_mm), rel=1e-15)
+    assert ABC_ANGLES_CONVENTION in places.title
+    assert frame.origin_distance_mm == pytest.approx(np.linalg.norm(frame.xyz_mm), rel=1e-15)

@@ -12,12 +12,16 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
-from minimax_cal.dynamics.regressor import Motion, inertial_parameters, inverse_dynamics
-from minimax_cal.ground.arrays import Array
-from minimax_cal.robots.mjcf import read_model
-from minimax_cal.robots.ranges import near_zero
+from minimax_cal.core.arrays import Array
+from minimax_cal.dynamics.regressor import (
+    JointMotion,
+    build_nominal_inertial_parameters,
+    inverse_dynamics,
+)
+from minimax_cal.robots.joint_ranges import clip_range_near_zero
+from minimax_cal.robots.mjcf_import import read_mujoco_model
 from minimax_cal.robots.robot import robot_from_dict
-from minimax_cal.robots.urdf import load_urdf
+from minimax_cal.robots.urdf_robot import load_urdf
 
 mujoco = pytest.importorskip("mujoco", reason="needs mujoco: pip install minimax-cal[mujoco]")
 
@@ -106,7 +110,7 @@ def test_mujoco_has_the_same_poses_and_torques(name, tmp_path):
     assert_allclose(robot.lower, np.where(limited, model.jnt_range[:, 0], -np.inf))
     assert_allclose(robot.upper, np.where(limited, model.jnt_range[:, 1], np.inf))
     rng = np.random.default_rng(3)
-    q = rng.uniform(*near_zero(robot.lower, robot.upper), (20, n))
+    q = rng.uniform(*clip_range_near_zero(robot.lower, robot.upper), (20, n))
     ours = seen.base @ robot.pose(q) @ seen.tool
     assert_allclose(ours, [pose_in(model, each, tip) for each in q], atol=1e-9)
     rate, change = rng.normal(size=(2, 20, n))
@@ -118,8 +122,12 @@ def test_mujoco_has_the_same_poses_and_torques(name, tmp_path):
         mujoco.mj_inverse(model, data)
         judge.append(data.qfrc_inverse.copy())
     size = np.linalg.norm(model.opt.gravity) / 9.80665  # ours knows one gravity: scale and compare
-    torque = inverse_dynamics(robot, Motion(q, rate, change), inertial_parameters(robot))
-    still = inverse_dynamics(robot, Motion(q, 0 * q, 0 * q), inertial_parameters(robot))
+    torque = inverse_dynamics(
+        robot, JointMotion(q, rate, change), build_nominal_inertial_parameters(robot)
+    )
+    still = inverse_dynamics(
+        robot, JointMotion(q, 0 * q, 0 * q), build_nominal_inertial_parameters(robot)
+    )
     assert_allclose(torque + (size - 1.0) * still, judge, atol=1e-8)
 
 
@@ -329,5 +337,5 @@ def test_a_mesh_that_is_missing_is_no_reason_where_masses_are_given(tmp_path):
         f'<robot name="r"><link name="w"/><link name="a">{link}</link><joint name="j" '
         'type="continuous"><parent link="w"/><child link="a"/><axis xyz="0 0 1"/></joint></robot>'
     )
-    model = read_model(urdf).compiled()
+    model = read_mujoco_model(urdf).compile_model()
     assert model.body_mass.sum() == 2.0

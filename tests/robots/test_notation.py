@@ -12,11 +12,11 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
-from minimax_cal.correcting.export import export
-from minimax_cal.correcting.exporters.table import EXPORTERS
+from minimax_cal.compensation.exporters.export_formats import EXPORTERS
+from minimax_cal.compensation.robot_export import export
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.robots.robot import robot_from_dict
-from minimax_cal.robots.transforms import links_table
+from minimax_cal.robots.transforms import build_links_table
 
 NOISE = 20e-6  # of a coordinate [m]
 Content = dict[str, Any]
@@ -132,7 +132,7 @@ def test_a_file_written_again_is_the_same_file(name, tmp_path):
     robot.save(tmp_path / "arm.json")
     again = mc.load_robot(tmp_path / "arm.json")
     assert_allclose(again.mdh, robot.mdh, rtol=0, atol=1e-15)
-    assert_allclose(again.turning, robot.turning)
+    assert_allclose(again.joint_to_chain_matrix, robot.joint_to_chain_matrix)
     written = json.loads((tmp_path / "arm.json").read_text())
     for old, new in zip(FILES[name]["joints"], written["joints"], strict=True):
         for key in ("a", "d"):
@@ -198,7 +198,7 @@ def test_options_and_tables_speak_of_the_files_rows(rng):
     assert found["theta2"].nominal == pytest.approx(-np.pi / 2)
     with pytest.raises(mc.OptionError, match="no parameter called 'a1'"):
         mc.calibrate(robot, data, "sum", fix="a1")
-    rows = links_table(robot).rows
+    rows = build_links_table(robot).rows
     assert rows[2][1:4] == pytest.approx((432.0, 149.0, 0.0))
 
 

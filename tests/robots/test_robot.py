@@ -6,7 +6,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 import minimax_cal as mc
-from minimax_cal.robots.angle_units import check_angles
+from minimax_cal.robots.angle_units import check_link_angle_unit
 from minimax_cal.robots.kinematics import MDH_NAMES
 from minimax_cal.robots.robot import robot_from_dict
 
@@ -226,7 +226,7 @@ def test_calibrated_angles_are_told_too(robot):
     ],
 )
 def test_angles_that_may_be_are_taken(unit, angles):
-    check_angles(np.array([angles]), unit, "robot")
+    check_link_angle_unit(np.array([angles]), unit, "robot")
 
 
 def test_limits_in_degrees_are_named(tmp_path, says):

@@ -12,9 +12,13 @@ from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
 from minimax_cal.robots.robot import robot_from_dict
-from minimax_cal.robots.transforms import from_rpy, to_rpy
-from minimax_cal.robots.urdf import random_joints, tip_poses, to_robot
-from minimax_cal.robots.urdf_file import edited, origin_edit, parse_urdf
+from minimax_cal.robots.transforms import pose_to_rpy, transform_from_xyz_rpy
+from minimax_cal.robots.urdf_file import apply_byte_edits, build_origin_edit, parse_urdf
+from minimax_cal.robots.urdf_robot import (
+    convert_urdf_to_robot,
+    random_joint_values_in_limits,
+    tip_poses,
+)
 
 EXACT = dict(rtol=0, atol=1e-9)
 ARM = (  # made up: a root off the axis, a downward axis, a slide, a bent tip
@@ -45,9 +49,9 @@ def urdf_of(rows: tuple[tuple[str, ...], ...], masses: bool = False) -> str:
 
 
 def same_poses(text: str, tip: str = "") -> mc.Robot:
-    model = to_robot(parse_urdf(text.encode()), tip)
+    model = convert_urdf_to_robot(parse_urdf(text.encode()), tip)
     robot = robot_from_dict(model.content)
-    q = random_joints(robot.lower, robot.upper)
+    q = random_joint_values_in_limits(robot.lower, robot.upper)
     poses = model.base @ robot.pose(q) @ model.tool
     assert_allclose(poses, tip_poses(model.chain, q), **EXACT)
     return robot
@@ -72,12 +76,12 @@ def test_pinocchio_reads_the_same_poses(fixed):
     for i, at in fixed.items():
         rows[i] = (*rows[i][:4], f'lower="{at}" upper="{at}"')
     text = urdf_of(tuple(rows))
-    model = to_robot(parse_urdf(text.encode()))
+    model = convert_urdf_to_robot(parse_urdf(text.encode()))
     robot = robot_from_dict(model.content)
     theirs = pinocchio.buildModelFromXML(text)
     data, frame = theirs.createData(), theirs.getFrameId(model.chain[-1].child)
     assert robot.joints == theirs.nq - len(fixed) == 4 - len(fixed)
-    for q in random_joints(robot.lower, robot.upper, 20):
+    for q in random_joint_values_in_limits(robot.lower, robot.upper, 20):
         pinocchio.framesForwardKinematics(theirs, data, np.array([*fixed.values(), *q]))
         ours = model.base @ robot.pose(q) @ model.tool
         assert_allclose(ours, data.oMf[frame].homogeneous, **EXACT)
@@ -85,11 +89,11 @@ def test_pinocchio_reads_the_same_poses(fixed):
 
 def test_masses_of_fixed_links_are_lumped():
     text = urdf_of(ARM, masses=True)
-    model = to_robot(parse_urdf(text.encode()))
+    model = convert_urdf_to_robot(parse_urdf(text.encode()))
     robot = robot_from_dict(model.content)
     assert_allclose(robot.mass, [3, 4 + 5, 6, 7, 8 + 9])
     # the centre of gravity of the last body, by the URDF's own frames and by ours
-    q = random_joints(robot.lower, robot.upper, 5)
+    q = random_joint_values_in_limits(robot.lower, robot.upper, 5)
     ends = {j.child: tip_poses(model.chain[: i + 1], q) for i, j in enumerate(model.chain)}
     theirs = sum(
         m * (ends[f"l{k}"] @ [0.01 * k, 0, 0.1, 1])[:, :3] for k, m in ((7, 8), (8, 9))
@@ -121,10 +125,12 @@ def test_any_chain(rows):
 def test_rpy_comes_back_near_what_stood_there(rng):
     steep = np.array(list(itertools.product((0.3, np.pi / 2, -np.pi / 2, np.pi), repeat=3)))
     for rpy in (*rng.uniform(-4, 4, (200, 3)), *steep):
-        pose = from_rpy(np.zeros(3), rpy)
-        assert_allclose(from_rpy(np.zeros(3), to_rpy(pose)), pose, rtol=0, atol=1e-14)
-        again = to_rpy(pose, rpy)
-        assert_allclose(from_rpy(np.zeros(3), again), pose, rtol=0, atol=1e-14)
+        pose = transform_from_xyz_rpy(np.zeros(3), rpy)
+        assert_allclose(
+            transform_from_xyz_rpy(np.zeros(3), pose_to_rpy(pose)), pose, rtol=0, atol=1e-14
+        )
+        again = pose_to_rpy(pose, rpy)
+        assert_allclose(transform_from_xyz_rpy(np.zeros(3), again), pose, rtol=0, atol=1e-14)
         if abs(np.cos(rpy[1])) > 1e-3:
             assert_allclose(again, rpy, rtol=0, atol=1e-9)
 
@@ -148,23 +154,23 @@ TWO_HANDS = """<robot name="r"><link name="a"/><link name="b"/><link name="left"
 def test_the_chain_is_named_where_there_are_several():
     urdf = parse_urdf(TWO_HANDS.encode(), "hands.urdf")
     with pytest.raises(mc.RobotError, match=r"several chains: they end in left, right; name .*tip"):
-        to_robot(urdf)
-    model = to_robot(urdf, "left")
+        convert_urdf_to_robot(urdf)
+    model = convert_urdf_to_robot(urdf, "left")
     assert [j.name for j in model.chain] == ["j", "jl"]
     assert any("jr" in notice for notice in model.notices)
     with pytest.raises(mc.RobotError, match="no link 'hand'; its ends are left, plate, right"):
-        to_robot(urdf, "hand")
+        convert_urdf_to_robot(urdf, "hand")
     with pytest.raises(mc.RobotError, match="no moving joint leads to 'plate'"):
-        to_robot(urdf, "plate")
+        convert_urdf_to_robot(urdf, "plate")
 
 
 def test_of_frames_on_one_body_tool0_is_meant():
     text = TWO_HANDS.replace('"jr" type="continuous"', '"jr" type="fixed"').replace(
         '"jl" type="continuous"', '"jl" type="fixed"'
     )
-    assert to_robot(parse_urdf(text.encode())).chain[-1].child == "b"
+    assert convert_urdf_to_robot(parse_urdf(text.encode())).chain[-1].child == "b"
     text = text.replace("left", "tool0")
-    assert to_robot(parse_urdf(text.encode())).chain[-1].child == "tool0"
+    assert convert_urdf_to_robot(parse_urdf(text.encode())).chain[-1].child == "tool0"
 
 
 def test_a_chain_between_two_links_and_grippers_left_out():
@@ -199,7 +205,7 @@ def test_a_chain_between_two_links_and_grippers_left_out():
     text = "".join([*lines, "</robot>"])
     urdf = parse_urdf(text.encode(), "cell.urdf")
     with pytest.raises(mc.RobotError, match=r"left_flange, right_flange; .* cell.urdf#left_flange"):
-        to_robot(urdf)
+        convert_urdf_to_robot(urdf)
     theirs = pinocchio.buildModelFromXML(text)
     data, q = theirs.createData(), pinocchio.randomConfiguration(theirs)
     pinocchio.framesForwardKinematics(theirs, data, q)
@@ -208,16 +214,18 @@ def test_a_chain_between_two_links_and_grippers_left_out():
         root, _, tip = spec.partition(":")
         if not tip:
             with pytest.raises(mc.RobotError, match="several chains"):
-                to_robot(urdf, spec)
+                convert_urdf_to_robot(urdf, spec)
             continue
-        model = to_robot(urdf, spec)
-        own = [q[theirs.joints[theirs.getJointId(j.name)].idx_q] for j in model.chain if j.moves]
+        model = convert_urdf_to_robot(urdf, spec)
+        own = [
+            q[theirs.joints[theirs.getJointId(j.name)].idx_q] for j in model.chain if j.is_moving
+        ]
         ours = model.base @ robot_from_dict(model.content).pose(np.array(own)) @ model.tool
         assert_allclose(ours, np.linalg.inv(there[root]) @ there[tip], **EXACT)
         up = model.base[:3, :3] @ robot_from_dict(model.content).up
         if root == "torso":
             assert_allclose(up, there["torso"][:3, :3].T @ [0, 0, 1], **EXACT)
-    assert to_robot(urdf, "right_link0:").chain[-1].child == "right_flange"
+    assert convert_urdf_to_robot(urdf, "right_link0:").chain[-1].child == "right_flange"
 
 
 ENDS = '<parent link="a"/><child link="b"/>'
@@ -283,13 +291,15 @@ def test_origins_change_and_no_other_byte():
   <joint name="k" type="continuous"><parent link="b"/><child link="c"/><origin/></joint>
 </robot>""".encode()
     urdf = parse_urdf(raw)
-    same = [origin_edit(raw, joint, lambda _: ("1 0 0", "0 0 1")) for joint in urdf.joints]
-    made = edited(raw, same)
+    same = [build_origin_edit(raw, joint, lambda _: ("1 0 0", "0 0 1")) for joint in urdf.joints]
+    made = apply_byte_edits(raw, same)
     origin = b'<origin xyz="1 0 0" rpy="0 0 1"/>'
     expected = raw.replace(b'b">\n', b'b">\n\t  ' + origin + b"\n", 1)
     assert made == expected.replace(b"<origin/>", origin)
     for joint in parse_urdf(made).joints:
-        assert_allclose(joint.origin, from_rpy(np.array([1, 0, 0]), np.array([0, 0, 1])))
+        assert_allclose(
+            joint.origin, transform_from_xyz_rpy(np.array([1, 0, 0]), np.array([0, 0, 1]))
+        )
 
 
 HOSTILE = (
@@ -345,8 +355,8 @@ def test_a_base_that_leans_in_the_root_link_is_said_with_its_turn(tmp_path):
     for rpy, turn in (("0 0 0", ""), ("0 0.785398163397448 0", "A 0 B 45 C 0 deg")):
         fixed = '<joint name="fix" type="fixed"><parent link="root"/><child link="a"/>'
         text = made_of(fixed + place.format(rpy) + "</joint>", limited("j", "revolute", "a b"))
-        model = to_robot(parse_urdf(text.encode()))
-        (said,) = model.remaining
+        model = convert_urdf_to_robot(parse_urdf(text.encode()))
+        (said,) = model.base_and_tool_notices
         assert "root link is not the robot's base" in said
         assert turn in said
         assert ("turned by" in said) == bool(turn)
@@ -369,7 +379,7 @@ def test_joints_of_the_chain_follow_one_beside_it(kind):
         limited("top", kind, "m t", '<mimic joint="middle" multiplier="2" offset="0.4"/>'),
         limited("turn", "revolute", "t tool", axis="0 1 0"),
     )
-    model = to_robot(parse_urdf(text.encode()), "tool")
+    model = convert_urdf_to_robot(parse_urdf(text.encode()), "tool")
     robot = robot_from_dict(model.content)
     assert robot.passive.tolist() == [False, True, False]
     assert model.content["joints"][0]["name"] == "column"
@@ -396,4 +406,4 @@ def test_a_joint_beside_the_chain_may_be_held_by_none(tmp_path):
     ):
         text = made_of(beside, limited("j", "revolute", "base tool", '<mimic joint="side"/>'))
         with pytest.raises(mc.RobotError, match=said):
-            to_robot(parse_urdf(text.encode()), "tool")
+            convert_urdf_to_robot(parse_urdf(text.encode()), "tool")

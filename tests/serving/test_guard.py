@@ -104,9 +104,9 @@ def test_it_listens_on_this_machine_alone(server):
 
 
 def test_the_pages_name_nothing_outside():
-    import minimax_cal.serving as serving
+    import minimax_cal.webapp as webapp
 
-    folder = Path(str(serving.__file__)).parent
+    folder = Path(str(webapp.__file__)).parent
     for path in (p for p in folder.iterdir() if p.suffix in (".js", ".css", ".jinja")):
         text = path.read_text()
         assert "http:" not in text, path

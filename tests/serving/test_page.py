@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose
 from served import PATIENCE, Served
 
 import minimax_cal as mc
-from minimax_cal.serving.sessions import GIVEN
+from minimax_cal.webapp.sessions import UPLOAD_FOLDER
 
 pytest.importorskip("uvicorn", reason="the page needs pip install minimax-cal[app]")
 pytestmark = pytest.mark.dev
@@ -195,10 +195,10 @@ def test_a_dh_table_can_be_typed(driver, server, poses):
         fields[5].send_keys(f"{arm.sign[i]:.0f}")
     click(driver, "#dh-use")
     folder = session_of(driver, server)
-    until((folder / GIVEN / "arm.csv").is_file, "the table did not arrive")
+    until((folder / UPLOAD_FOLDER / "arm.csv").is_file, "the table did not arrive")
     until(lambda: state(driver, "robot") == "done", "the table is not chosen")
     do(driver, "fit", "#fit")
-    assert "convention: standard" in (folder / GIVEN / "arm.csv").read_text()
+    assert "convention: standard" in (folder / UPLOAD_FOLDER / "arm.csv").read_text()
     typed = mc.load_fit(folder / "fit.json")
     assert typed.within.after.rms_mm == pytest.approx(
         mc.calibrate("irb120", folder / "poses.csv").within.after.rms_mm, rel=1e-3

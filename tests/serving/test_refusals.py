@@ -15,13 +15,13 @@ from urllib.parse import quote
 import pytest
 from served import PATIENCE, Served, serving
 
-from minimax_cal.measuring.importers import read_any
-from minimax_cal.measuring.importers.tables import Given
+from minimax_cal.measuring.importers import read_in_first_fitting_format
+from minimax_cal.measuring.importers.column_tables import ImportOptions
 
 pytest.importorskip("uvicorn", reason="the page needs pip install minimax-cal[app]")
 
-from minimax_cal.serving import connection
-from minimax_cal.serving.routes import ROUTES
+from minimax_cal.webapp import bounded_connection
+from minimax_cal.webapp.routes import PAGE_ROUTES
 
 JOINTS = "Pose,q1_deg,q2_deg\nP1,1,2\nP2,3,4\n"
 POINTS = "Pose,x_mm,y_mm,z_mm\nP1,1,2,3\nP2,3,4,5\n"
@@ -119,7 +119,7 @@ def test_a_refused_request_changes_nothing(server, home):
 def test_every_route_that_changes_is_asked_for_what_it_refuses():
     asked = {(method, path.partition("?")[0].split("/")[1:2][0]) for method, path, _ in REFUSED
              if path}  # fmt: skip
-    for route in ROUTES:
+    for route in PAGE_ROUTES:
         name = route.path.removeprefix("/s/{session}").split("/")[1:2]
         for method in (route.methods or set()) - {"GET", "HEAD"}:
             if route.path not in ("/sessions", "/s/{session}/cancel"):
@@ -210,8 +210,9 @@ def read_large(server: Served, home: str, kind: str, content: bytes) -> None:
 def impatient(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     """A server whose patience is a tenth."""
     code = (
-        "import minimax_cal.serving.connection as c, minimax_cal.cli as m; "
-        "c.HEAD_SECONDS /= 10; c.BODY_SECONDS /= 30; c.WRITE_SECONDS /= 60; m.main()"
+        "import minimax_cal.webapp.bounded_connection as c, minimax_cal.cli as m; "
+        "c.MAX_HEAD_SECONDS /= 10; c.MAX_SILENT_BODY_SECONDS /= 30; "
+        "c.MAX_BLOCKED_WRITE_SECONDS /= 60; m.main()"
     )
     with serving(tmp_path_factory.mktemp("impatient"), "-c", code) as found:
         yield found
@@ -276,7 +277,7 @@ def test_an_answer_that_nobody_reads_ends(impatient):
     )
     with socket.create_connection(("127.0.0.1", impatient.port)) as line:
         line.sendall(request.encode())
-        time.sleep(connection.WRITE_SECONDS / 60 + 2.0)
+        time.sleep(bounded_connection.MAX_BLOCKED_WRITE_SECONDS / 60 + 2.0)
         taken = 0
         try:
             while part := line.recv(1 << 20):
@@ -304,7 +305,7 @@ def test_a_connection_that_asks_stays(impatient):
 
 def test_the_large_file_is_one_that_is_read(large, tmp_path):
     (tmp_path / "large.csv").write_bytes(large[: 1 << 20].rpartition(b"\n")[0])
-    assert read_any(tmp_path / "large.csv", Given()).joints
+    assert read_in_first_fitting_format(tmp_path / "large.csv", ImportOptions()).joint_columns
 
 
 # ---- processes that die --------------------------------------------------------------------------
@@ -317,7 +318,7 @@ def test_readers_that_were_killed_are_replaced(busy):
     before = busy.state(made)
     number = busy.process.pid
     children = Path(f"/proc/{number}/task/{number}/children").read_text().split()
-    readers = [pid for pid in children if b"serving.reader" in
+    readers = [pid for pid in children if b"webapp.session_reader" in
                Path(f"/proc/{pid}/cmdline").read_bytes()]  # fmt: skip
     assert readers
     for pid in readers:

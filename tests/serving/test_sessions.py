@@ -8,24 +8,24 @@ from pathlib import Path
 
 import pytest
 
-from minimax_cal.ground.errors import CalibrationError, OptionError
-from minimax_cal.serving.sessions import (
-    CHOICES,
-    GIVEN,
-    RESERVED,
+from minimax_cal.core.errors import CalibrationError, OptionError
+from minimax_cal.webapp.sessions import (
+    CHOICES_FILE,
+    RESERVED_NAME_PATTERN,
+    UPLOAD_FOLDER,
     Session,
-    new_session,
-    plain_name,
-    remove_parts,
-    session,
-    sessions,
+    check_file_name,
+    create_session_folder,
+    list_sessions,
+    open_session,
+    remove_abandoned_partial_files,
 )
 
 
 @pytest.fixture
 def at(tmp_path: Path) -> Session:
-    made = new_session(tmp_path, "Cell 7: the blue one")
-    (made.folder / GIVEN / "poses.csv").write_text("q1_deg\n")
+    made = create_session_folder(tmp_path, "Cell 7: the blue one")
+    (made.folder / UPLOAD_FOLDER / "poses.csv").write_text("q1_deg\n")
     return made
 
 
@@ -37,52 +37,54 @@ def at(tmp_path: Path) -> Session:
 )  # fmt: skip
 def test_names_that_are_refused(at, name):
     with pytest.raises(OptionError, match=r"^file name "):
-        at.file(GIVEN, name)
+        at.resolve_file(UPLOAD_FOLDER, name)
 
 
 @pytest.mark.parametrize("name", ["poses.csv", "Meßwerte (2).txt", "smr_1.txt", "T_ROB1.mod"])
 def test_names_that_serve(name):
-    assert plain_name(name) == name
+    assert check_file_name(name) == name
 
 
 def test_a_link_leads_nowhere_else(at, tmp_path):
     (tmp_path / "secret").write_text("x")
     os.symlink(tmp_path / "secret", at.folder / "fit.json")
     with pytest.raises(OptionError, match="leads out"):
-        at.file("fit.json")
+        at.resolve_file("fit.json")
 
 
 def test_sessions_have_names_of_their_own(at, tmp_path):
-    other = new_session(tmp_path, "Cell 7: the blue one")
+    other = create_session_folder(tmp_path, "Cell 7: the blue one")
     assert (at.name, other.name) == ("cell-7-the-blue-one", "cell-7-the-blue-one-2")
-    assert new_session(tmp_path, "../..").folder.parent == tmp_path
-    assert {one.name for one in sessions(tmp_path)} >= {at.name, other.name}
+    assert create_session_folder(tmp_path, "../..").folder.parent == tmp_path
+    assert {one.name for one in list_sessions(tmp_path)} >= {at.name, other.name}
     for name in ("", "..", "none", "../x", "Cell"):
         with pytest.raises(OptionError, match="no session"):
-            session(tmp_path, name)
+            open_session(tmp_path, name)
 
 
 @pytest.mark.parametrize("title", ["con", "NUL", "prn.", " aux ", "Com1", "lpt9...", "con...  "])
 def test_no_session_has_the_name_of_a_device(tmp_path, title):
-    made = new_session(tmp_path, title)
-    assert not RESERVED.fullmatch(made.name)
-    assert session(tmp_path, made.name).folder.is_dir()
+    made = create_session_folder(tmp_path, title)
+    assert not RESERVED_NAME_PATTERN.fullmatch(made.name)
+    assert open_session(tmp_path, made.name).folder.is_dir()
 
 
 def test_a_folder_in_capitals_is_the_same_where_the_system_says_so(tmp_path):
     (tmp_path / "CELL").mkdir()
-    assert new_session(tmp_path, "cell").name == "cell-2"
+    assert create_session_folder(tmp_path, "cell").name == "cell-2"
 
 
 def test_a_session_that_cannot_be_made_leaves_no_folder(tmp_path, monkeypatch):
-    monkeypatch.setattr("minimax_cal.serving.sessions.LOG", "x" * 300)
+    monkeypatch.setattr("minimax_cal.webapp.sessions.LOG_FOLDER", "x" * 300)
     with pytest.raises(CalibrationError, match="cannot be made"):
-        new_session(tmp_path, "cell")
+        create_session_folder(tmp_path, "cell")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_choices_are_kept_as_they_were_made(at):
-    at.choose({"measured": ["poses.csv"], "robot": "irb120", "left_out": ["12:smr2"], "rms": 0.2})
+    at.update_choices(
+        {"measured": ["poses.csv"], "robot": "irb120", "left_out": ["12:smr2"], "rms": 0.2}
+    )
     again = Session(at.folder).choices
     assert again.measured == ("poses.csv",)
     assert again.left_out == ("12:smr2",)
@@ -99,38 +101,39 @@ def test_choices_are_kept_as_they_were_made(at):
      {"reasons": {f"{line}:smr1": "knocked" for line in range(100_000)}}],
 )  # fmt: skip
 def test_choices_that_are_refused_change_nothing(at, changes):
-    before = at.choose({"measured": ["poses.csv"]})
+    before = at.update_choices({"measured": ["poses.csv"]})
     with pytest.raises(OptionError):
-        at.choose(changes)
+        at.update_choices(changes)
     assert at.choices == before
 
 
 def test_a_removed_file_is_chosen_no_more(at):
-    at.choose({"measured": ["poses.csv"], "joints": "poses.csv"})
-    left = at.remove("poses.csv")
+    at.update_choices({"measured": ["poses.csv"], "joints": "poses.csv"})
+    left = at.remove_uploaded_file("poses.csv")
     assert (left.measured, left.joints) == ((), "")
-    assert at.given() == []
+    assert at.list_uploaded_files() == []
 
 
 @pytest.mark.parametrize(
     "change",
-    [lambda at: at.remove("poses.csv"), lambda at: at.take("measured", ["new.csv"], {}),
-     lambda at: at.take("targets", ["poses.csv"], {})],
+    [lambda at: at.remove_uploaded_file("poses.csv"),
+     lambda at: at.choose_files_and_delete_replaced("measured", ["new.csv"], {}),
+     lambda at: at.choose_files_and_delete_replaced("targets", ["poses.csv"], {})],
     ids=["remove", "take", "targets"],
 )  # fmt: skip
 def test_files_stay_where_choices_cannot_be_written(at, change):
     """A file goes only once no choice is about it."""
-    (at.folder / CHOICES).write_text("{")
+    (at.folder / CHOICES_FILE).write_text("{")
     with pytest.raises(OptionError, match=r"session\.json"):
         change(at)
-    assert at.given() == ["poses.csv"]
+    assert at.list_uploaded_files() == ["poses.csv"]
 
 
 def test_a_file_that_is_gone_keeps_no_other_choice(at):
-    at.choose({"measured": ["poses.csv"]})
-    (at.folder / GIVEN / "poses.csv").unlink()
-    assert at.choose({"rms": 0.1}).rms == 0.1
-    assert at.remove("poses.csv").measured == ()
+    at.update_choices({"measured": ["poses.csv"]})
+    (at.folder / UPLOAD_FOLDER / "poses.csv").unlink()
+    assert at.update_choices({"rms": 0.1}).rms == 0.1
+    assert at.remove_uploaded_file("poses.csv").measured == ()
 
 
 JOINTS = "Pose,q1_deg,q2_deg\nP1,1,2\nP2,3,4\n"
@@ -140,7 +143,9 @@ NO_HEADER = "1 2 3\n4 5 6\n"
 
 
 def take_measured(at: Session, names: Iterable[str]) -> None:
-    at.take("measured", [*names], {n: at.held(n) for n in {*names, *at.choices.measured}})
+    at.choose_files_and_delete_replaced(
+        "measured", [*names], {n: at.read_content_kinds(n) for n in {*names, *at.choices.measured}}
+    )
 
 
 @pytest.mark.parametrize(
@@ -158,72 +163,72 @@ def take_measured(at: Session, names: Iterable[str]) -> None:
 def test_a_dropped_file_replaces_what_holds_the_same(at, before, dropped, left):
     for files in (before, dropped):
         for name, text in files.items():
-            (at.folder / GIVEN / name).write_text(text)
+            (at.folder / UPLOAD_FOLDER / name).write_text(text)
         if files:
             take_measured(at, files)
     assert list(at.choices.measured) == left
-    assert set(at.given()) == {"poses.csv", *left}
+    assert set(at.list_uploaded_files()) == {"poses.csv", *left}
 
 
 def test_targets_replace_those_before_and_robots_stay_to_choose(at):
     for name in ("a.csv", "b.csv", "arm.json", "other.json"):
-        (at.folder / GIVEN / name).write_text("x")
+        (at.folder / UPLOAD_FOLDER / name).write_text("x")
     for kind, names in (("targets", ("a.csv", "b.csv")), ("robot", ("arm.json", "other.json"))):
         for name in names:
-            at.take(kind, [name], {})
+            at.choose_files_and_delete_replaced(kind, [name], {})
     assert (at.choices.targets, at.choices.robot) == ("b.csv", "other.json")
-    assert at.given() == ["arm.json", "b.csv", "other.json", "poses.csv"]
+    assert at.list_uploaded_files() == ["arm.json", "b.csv", "other.json", "poses.csv"]
     for kind, names in (("report", ["a.csv"]), ("robot", []), ("robot", ["../x"])):
         with pytest.raises(OptionError):
-            at.take(kind, names, {})
+            at.choose_files_and_delete_replaced(kind, names, {})
 
 
 def test_a_session_is_full_at_last(at, monkeypatch):
-    assert at.room("new.csv") == 256 << 20
-    monkeypatch.setattr("minimax_cal.serving.sessions.MOST_TOGETHER", 10)
-    assert at.room("new.csv") == 3  # beside the seven bytes of the one that is there
-    assert at.room("poses.csv") == 10  # in its place
-    monkeypatch.setattr("minimax_cal.serving.sessions.MOST_FILES", 1)
+    assert at.available_bytes("new.csv") == 256 << 20
+    monkeypatch.setattr("minimax_cal.webapp.sessions.MAX_SESSION_BYTES", 10)
+    assert at.available_bytes("new.csv") == 3  # beside the seven bytes of the one that is there
+    assert at.available_bytes("poses.csv") == 10  # in its place
+    monkeypatch.setattr("minimax_cal.webapp.sessions.MAX_UPLOADED_FILES", 1)
     with pytest.raises(OptionError, match="remove some"):
-        at.room("new.csv")
+        at.available_bytes("new.csv")
 
 
 @pytest.mark.parametrize("text", ["{", "[" * 100_000], ids=["cut", "deep"])
 def test_choices_that_somebody_broke_are_told(at, text):
-    (at.folder / CHOICES).write_text(text)
+    (at.folder / CHOICES_FILE).write_text(text)
     with pytest.raises(OptionError, match=r"session\.json"):
         at.choices  # noqa: B018
 
 
 def test_the_stamp_changes_with_every_file(at):
-    before = at.stamp()
-    assert at.stamp() == before
+    before = at.list_file_versions()
+    assert at.list_file_versions() == before
     (at.folder / "fit.json").write_text("{}")
-    assert at.stamp() != before
+    assert at.list_file_versions() != before
 
 
 def test_files_that_are_being_written_take_their_room(at, monkeypatch):
     """Two that are sent at once must not fill a session beyond its limit."""
-    monkeypatch.setattr("minimax_cal.serving.sessions.MOST_TOGETHER", 1000)
-    part = at.part("large.csv", 900)
+    monkeypatch.setattr("minimax_cal.webapp.sessions.MAX_SESSION_BYTES", 1000)
+    part = at.reserve_upload_file("large.csv", 900)
     assert part.stat().st_size == 900
-    assert at.given() == ["poses.csv"]  # it is not there yet
-    assert at.room("new.csv") == 1000 - 900 - 7
-    monkeypatch.setattr("minimax_cal.serving.sessions.MOST_FILES", 2)
+    assert at.list_uploaded_files() == ["poses.csv"]  # it is not there yet
+    assert at.available_bytes("new.csv") == 1000 - 900 - 7
+    monkeypatch.setattr("minimax_cal.webapp.sessions.MAX_UPLOADED_FILES", 2)
     with pytest.raises(OptionError, match="remove some"):
-        at.room("new.csv")
+        at.available_bytes("new.csv")
 
 
 def test_parts_that_a_killed_server_left_are_removed(at):
-    old, new = at.part("old.csv", 10), at.part("new.csv", 10)
+    old, new = at.reserve_upload_file("old.csv", 10), at.reserve_upload_file("new.csv", 10)
     os.utime(old, (time.time() - 7200.0,) * 2)
-    remove_parts(at.folder.parent)
+    remove_abandoned_partial_files(at.folder.parent)
     assert not old.exists()
     assert new.exists()
 
 
 @pytest.mark.skipif(os.name == "nt", reason="permissions are those of POSIX")
 def test_sessions_are_private(at):
-    folders = (at.folder, at.folder / GIVEN, at.folder / "log")
+    folders = (at.folder, at.folder / UPLOAD_FOLDER, at.folder / "log")
     assert {stat.S_IMODE(path.stat().st_mode) for path in folders} == {0o700}
-    assert stat.S_IMODE(at.part("x.csv", 3).stat().st_mode) == 0o600
+    assert stat.S_IMODE(at.reserve_upload_file("x.csv", 3).stat().st_mode) == 0o600

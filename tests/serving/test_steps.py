@@ -6,31 +6,34 @@ from pathlib import Path
 import click
 import pytest
 
-from minimax_cal.cli.running import cli
-from minimax_cal.ground.errors import OptionError
-from minimax_cal.serving.sessions import GIVEN, Session, new_session
-from minimax_cal.serving.steps import DIAGNOSIS, FIT, POSES, STEPS
+from minimax_cal.cli.command_runner import cli
+from minimax_cal.core.errors import OptionError
+from minimax_cal.webapp.sessions import UPLOAD_FOLDER, Session, create_session_folder
+from minimax_cal.webapp.step_commands import DIAGNOSIS_FILE, FIT_FILE, POSES_FILE, SESSION_STEPS
 
 RESULT = '{"provenance": {"data_sha256": "abc"}}'
 
 
 @pytest.fixture
 def at(tmp_path: Path) -> Session:
-    made = new_session(tmp_path, "cell")
+    made = create_session_folder(tmp_path, "cell")
     for name in ("tracker (1).csv", "joints.txt", "targets.csv"):
-        (made.folder / GIVEN / name).write_text("x")
+        (made.folder / UPLOAD_FOLDER / name).write_text("x")
     return made
 
 
 def lines(at: Session, step: str) -> list[str]:
-    return [command.line() for command in STEPS[step].commands(at, at.choices)]
+    return [
+        command.format_shell_line()
+        for command in SESSION_STEPS[step].build_commands(at, at.choices)
+    ]
 
 
 def everything(at: Session) -> None:
     """A session in which every step can be done."""
-    for name in (POSES, FIT, DIAGNOSIS):
+    for name in (POSES_FILE, FIT_FILE, DIAGNOSIS_FILE):
         (at.folder / name).write_text(RESULT)
-    at.choose(
+    at.update_choices(
         {"measured": ["tracker (1).csv", "joints.txt"], "joints": "joints.txt", "robot": "irb120",
          "units": "--json", "targets": "targets.csv", "left_out": ["12:smr2", "40"], "rms": 0.2,
          "most": 0.5, "effects": True, "quick": True}
@@ -39,7 +42,7 @@ def everything(at: Session) -> None:
 
 def test_points_are_set_aside_with_their_reasons(at):
     everything(at)
-    at.choose({"left_out": ["3:smr1", "12:smr2", "40"],
+    at.update_choices({"left_out": ["3:smr1", "12:smr2", "40"],
                "reasons": {"12:smr2": "nest, knocked", "40": "nest, knocked"}})  # fmt: skip
     assert lines(at, "fit")[0] == (
         "minimax-cal import poses.csv --leave-out=3:smr1 '--leave-out=12:smr2,40=nest, knocked' "
@@ -71,11 +74,11 @@ def test_the_lines_are_what_people_would_type(at):
 
 def test_a_diagnosis_of_other_measurements_joins_no_report(at):
     everything(at)
-    (at.folder / DIAGNOSIS).write_text(RESULT.replace("abc", "def"))
+    (at.folder / DIAGNOSIS_FILE).write_text(RESULT.replace("abc", "def"))
     assert "diagnosis.json" not in lines(at, "judge")[0]
 
 
-@pytest.mark.parametrize("step", STEPS)
+@pytest.mark.parametrize("step", SESSION_STEPS)
 def test_the_command_line_takes_every_line(at, step):
     """Each option is one that its command has, and every value is that of its option."""
     everything(at)

@@ -12,9 +12,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.correcting.export import exported, written
-from minimax_cal.correcting.exporters.job import job_of
-from minimax_cal.modelling.cell import still
+from minimax_cal.compensation.exporters.export_job import build_export_job
+from minimax_cal.compensation.robot_export import build_export, write_exported_files
+from minimax_cal.modelling.cell import build_measurements_at_rest
 from minimax_cal.simulators.mjcf import write
 from minimax_cal.simulators.result import SimulatorGap
 from tests.conftest import run
@@ -24,10 +24,10 @@ from tests.simulators.test_mjcf import cell_with, in_base, poses, robot_called, 
 mujoco = pytest.importorskip("mujoco", reason="needs mujoco: pip install minimax-cal[mujoco]")
 
 from experiments import simulator_gap as study  # noqa: E402
-from minimax_cal.robots.document import Writing, read_document  # noqa: E402
-from minimax_cal.robots.mjcf import read_model  # noqa: E402
-from minimax_cal.simulators.chain import chain_of  # noqa: E402
-from minimax_cal.simulators.drive import drive  # noqa: E402
+from minimax_cal.robots.mjcf_import import read_mujoco_model  # noqa: E402
+from minimax_cal.robots.xml_document import XmlWriteOptions, read_xml_with_includes  # noqa: E402
+from minimax_cal.simulators.chain import find_model_arm  # noqa: E402
+from minimax_cal.simulators.drive import drive_to_poses  # noqa: E402
 
 HOLDS, HOLDS_MM = 0.1, 0.02  # of what an effect does, or [mm]
 STILL = 2e-3  # [rad/s]
@@ -56,7 +56,7 @@ def test_a_new_file_holds_still_and_moves(name):
     cell = cell_with(robot, "joint_compliance:all", "encoder_gain:all", "base_flex:frame",
                      size=3e-6, base_flex=[2e-7],
                      encoder_gain=[2e-4] * int((~robot.prismatic).sum()))  # fmt: skip
-    text = write(job_of("cell", cell)).content.decode()
+    text = write(build_export_job("cell", cell)).content.decode()
     check_held(text, cell, poses(robot, 4))
     model = mujoco.MjModel.from_xml_string(text)
     assert model.actuator_gainprm[:, 0].max() < LARGEST_GAIN
@@ -68,7 +68,7 @@ def test_one_compliant_joint_among_stiff_ones_has_a_spring():
     robot = with_masses(robot_called("irb2600"))
     cell = cell_with(robot, "joint_compliance:J2", "link_bending:L1", size=3e-6,
                      link_bending=[1e-6])  # fmt: skip
-    text = write(job_of("cell", cell)).content.decode()
+    text = write(build_export_job("cell", cell)).content.decode()
     check_held(text, cell, poses(robot, 4))
     model = mujoco.MjModel.from_xml_string(text)
     assert model.jnt_stiffness[model.joint("flex2").id] == pytest.approx(1.0 / 3e-6, rel=0.3)
@@ -89,7 +89,7 @@ def test_a_new_file_stands_and_moves_in_a_default_scene(name):
     robot = robot_called(name)
     effects = [] if name == "ur10" else ["joint_compliance:J2", "encoder_gain:J1"]
     cell = cell_with(robot, *effects, size=1e-7)
-    text = write(job_of("cell", cell)).content.decode()
+    text = write(build_export_job("cell", cell)).content.decode()
     model, q = in_default_scene(text), poses(robot, 3)
     assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
     assert model.opt.timestep == 0.002
@@ -105,8 +105,8 @@ def test_a_file_corrected_again_stays_braked_in_its_joints(tmp_path):
     robot = with_masses(robot_called("ur10"))
     cell = cell_with(robot, "joint_compliance:all", size=3e-6)
     path = tmp_path / "arm.xml"
-    path.write_bytes(write(job_of("cell", cell_with(robot))).content)
-    job = replace(job_of("cell", cell), nominal=robot, fitted=True, model=path,
+    path.write_bytes(write(build_export_job("cell", cell_with(robot))).content)
+    job = replace(build_export_job("cell", cell), nominal=robot, fitted=True, model=path,
                   path=tmp_path / "out.xml")  # fmt: skip
     text = write(job).content.decode()
     model = mujoco.MjModel.from_xml_string(text)
@@ -124,9 +124,9 @@ def test_what_is_delivered_is_what_the_file_reaches():
     truth = cell_with(real, *effects, size=2e-6, link_bending=[1e-6])
     q = rng.uniform(np.maximum(real.lower, -2.0), np.minimum(real.upper, 2.0), (24, 6))
     y = truth.predict(q) + 1e-5 * rng.normal(size=(24, 3, 3))
-    data = replace(still(q, truth.target_names, real), y=y, source="twin.csv")
+    data = replace(build_measurements_at_rest(q, truth.target_names, real), y=y, source="twin.csv")
     fit = mc.calibrate(name, data, "sum", effects=effects)
-    made = exported(fit, "mjcf")
+    made = build_export(fit, "mjcf")
     held = data.take(fit.held)
     reached = drive_alone(
         made.file.content.decode(), held.q[[0, *range(len(held.q))]], held.target_names
@@ -146,7 +146,7 @@ def test_what_is_delivered_is_what_the_file_reaches():
 
 def measured(folder: Path, model: Path) -> mc.Fit:
     """A fit of a compliant arm that has the masses of a model."""
-    weighs = chain_of(read_model(model).compiled(), 6, str(model)).robot
+    weighs = find_model_arm(read_mujoco_model(model).compile_model(), 6, str(model)).robot
     truth = mc.Truth(compliance=8e-6)
     data = mc.simulate(weighs, 40, 3, seed=3, truth=truth).data
     mc.write_measurements(folder / "poses.csv", data)
@@ -224,17 +224,17 @@ def test_a_file_is_written_byte_for_byte(tmp_path):
     )
     (tmp_path / "odd.xml").write_bytes(odd)
     (tmp_path / "empty.xml").write_bytes(b"<mujoco><!-- nothing --></mujoco>")
-    assert read_document(path).raw() == path.read_bytes()
-    document = read_document(tmp_path / "odd.xml")
-    assert document.raw() == odd
+    assert read_xml_with_includes(path).to_bytes() == path.read_bytes()
+    document = read_xml_with_includes(tmp_path / "odd.xml")
+    assert document.to_bytes() == odd
     option = document.root.find("option")
     assert option is not None
     option.set("timestep", "0.001")
-    assert document.raw() == odd.replace(b"'0.002'", b"'0.001'")
+    assert document.to_bytes() == odd.replace(b"'0.002'", b"'0.001'")
     del option.attrib["timestep"]
     option.set("integrator", "Euler")
     changed = odd.replace(b"<option\r\n  timestep='0.002'/>", b'<option integrator="Euler"/>')
-    assert document.raw() == changed
+    assert document.to_bytes() == changed
 
 
 def test_an_include_is_written_out_only_where_it_changed(tmp_path):
@@ -245,13 +245,13 @@ def test_an_include_is_written_out_only_where_it_changed(tmp_path):
         "<mujocoinclude>\n  <option gravity='0 0 0'/>\n</mujocoinclude>"
     )
     (tmp_path / "b.xml").write_text("<mujocoinclude>\n  <size nkey='1'/>\n</mujocoinclude>")
-    document = read_document(tmp_path / "arm.xml")
+    document = read_xml_with_includes(tmp_path / "arm.xml")
     document.root[0].set("gravity", "0 0 -9")
     changed = "<option gravity='0 0 -9'/>"
     whole = f"<mujoco>\n  {changed}\n  <include file='b.xml'/>\n</mujoco>\n"
-    assert document.raw().decode() == whole
-    how = Writing(name="new")
-    assert document.raw(how).decode() == whole.replace(changed, "<include file='new.a.xml'/>")
+    assert document.to_bytes().decode() == whole
+    how = XmlWriteOptions(name="new")
+    assert document.to_bytes(how).decode() == whole.replace(changed, "<include file='new.a.xml'/>")
     assert how.beside == {".a.xml": f"<mujocoinclude>\n  {changed}\n</mujocoinclude>".encode()}
 
 
@@ -265,13 +265,23 @@ def test_a_scene_stays_and_the_arm_that_it_includes_is_beside_it(folder, tmp_pat
         f"  <worldbody><light pos='{LIGHT}'/></worldbody>\n</mujoco>\n"
     )
     (tmp_path / folder).mkdir(exist_ok=True)
-    weighs = chain_of(read_model(model).compiled(), 6, str(model)).robot
+    weighs = find_model_arm(read_mujoco_model(model).compile_model(), 6, str(model)).robot
     cell = cell_with(weighs, "joint_compliance:J2", size=5e-6)
     made = {}
     for given, name in ((scene, "new_scene.xml"), (model, "new_arm.xml")):
         path = tmp_path / folder / name
-        written(write(replace(job_of("cell", cell), nominal=weighs, fitted=True, model=given,
-                                path=path)), path)  # fmt: skip
+        write_exported_files(
+            write(
+                replace(
+                    build_export_job("cell", cell),
+                    nominal=weighs,
+                    fitted=True,
+                    model=given,
+                    path=path,
+                )
+            ),
+            path,
+        )
         made[name] = mujoco.MjModel.from_xml_path(str(path))
     root = ElementTree.parse(tmp_path / folder / "new_scene.xml").getroot()
     included = f"new_scene.{model.stem}.xml"
@@ -290,10 +300,10 @@ def test_a_keyframe_grows_with_the_springs(tmp_path):
     model = ur10_like(tmp_path)
     text = model.read_text().replace("qpos='0 0 0 0 0 0 '", "qpos='1 2 3 4 5 6'")
     model.write_text(text)
-    weighs = chain_of(read_model(model).compiled(), 6, str(model)).robot
+    weighs = find_model_arm(read_mujoco_model(model).compile_model(), 6, str(model)).robot
     cell = cell_with(weighs, "joint_compliance:J2", "base_flex:frame", size=5e-6, base_flex=[2e-7])
     job = replace(
-        job_of("cell", cell),
+        build_export_job("cell", cell),
         nominal=weighs,
         fitted=True,
         model=model,
@@ -308,10 +318,10 @@ def test_a_keyframe_grows_with_the_springs(tmp_path):
 
 def test_a_command_map_reaches_what_the_fit_says(tmp_path):
     model = ur10_like(tmp_path)
-    weighs = chain_of(read_model(model).compiled(), 6, str(model)).robot
+    weighs = find_model_arm(read_mujoco_model(model).compile_model(), 6, str(model)).robot
     cell = cell_with(weighs, "joint_compliance:all", "gear_error:J3:turns=1", size=8e-6,
                      gear_error=[4e-4, -2e-4])  # fmt: skip
-    job = replace(job_of("cell", cell), nominal=weighs, fitted=True, model=model)
+    job = replace(build_export_job("cell", cell), nominal=weighs, fitted=True, model=model)
     made = write(replace(job, path=tmp_path / "out.xml"))
     (tmp_path / "out.xml").write_bytes(made.content)
     (tmp_path / "out.commands.json").write_bytes(made.beside[".commands.json"])
@@ -353,14 +363,16 @@ def test_a_limit_that_binds_is_counted(tmp_path):
     """A limit above the weight, below what the move asks for."""
     q = np.array([[0.0, -1.5, 0.0, 0.0, 0.0, 0.0], [0.0, -0.4, 0.0, 0.0, 0.0, 0.0]] * 2)
     free = ur10_like(tmp_path)
-    chain = chain_of(read_model(free).compiled(), 6, str(free))
-    assert drive(chain, q, "free").limited.max() == 0.0
+    chain = find_model_arm(read_mujoco_model(free).compile_model(), 6, str(free))
+    assert drive_to_poses(chain, q, "free").share_at_force_limit.max() == 0.0
     model, data = chain.model, mujoco.MjData(chain.model)
     data.qpos[:] = q[1]
     mujoco.mj_forward(model, data)
     tight = (330.0, 1.002 * abs(float(data.qfrc_bias[1])), 150.0, 56.0, 56.0, 56.0)
     bound = ur10_like(tmp_path, limits=tight)
-    limited = drive(chain_of(read_model(bound).compiled(), 6, str(bound)), q, "bound").limited
+    limited = drive_to_poses(
+        find_model_arm(read_mujoco_model(bound).compile_model(), 6, str(bound)), q, "bound"
+    ).share_at_force_limit
     assert limited[1] > SELDOM
     assert limited[[0, 2, 3, 4, 5]].max() == 0.0
 
@@ -368,7 +380,7 @@ def test_a_limit_that_binds_is_counted(tmp_path):
 @pytest.mark.parametrize("name", ["ur10", "irb2600", "seven_axes"])
 @pytest.mark.slow
 def test_the_study_s_corrected_files_hold_still_and_move(name, tmp_path):
-    result = study.run(study.Trial(name, 48, 0))
+    result = study.run_trial(study.SimulatorTrial(name, 48, 0))
     assert abs(result.alone_mm - result.gap.rungs[-1].holdout_rms_mm) < HOLDS_MM
     assert result.speed < STILL
     assert result.limited < SELDOM

@@ -10,23 +10,23 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
-from minimax_cal.diagnosing.result import load_diagnosis
-from minimax_cal.modelling.cell import still
-from minimax_cal.modelling.effects.table import Fitted, Term, terms
-from minimax_cal.reporting.html import read_sources
-from minimax_cal.robots.gravity import tubes
-from minimax_cal.robots.sampling import random_poses
-from minimax_cal.simulators.result import Rung, SimulatorGap
+from minimax_cal.diagnosing.diagnosis import load_diagnosis
+from minimax_cal.modelling.cell import build_measurements_at_rest
+from minimax_cal.modelling.effects.table import Fitted, Term, parse_effect_terms
+from minimax_cal.reporting.html import read_report_sources
+from minimax_cal.robots.gravity_torques import assumed_link_masses_and_centres
+from minimax_cal.robots.joint_sampling import random_joint_values_above_floor
+from minimax_cal.simulators.result import GapStep, SimulatorGap
 from tests.conftest import run, shared
 from tests.problems_mjcf import published_like
 
 mujoco = pytest.importorskip("mujoco", reason="needs mujoco: pip install minimax-cal[mujoco]")
 
 from experiments import simulator_gap as study  # noqa: E402
-from minimax_cal.robots.mjcf import read_model  # noqa: E402
-from minimax_cal.simulators import ladder  # noqa: E402
-from minimax_cal.simulators.chain import chain_of  # noqa: E402
-from minimax_cal.simulators.ladder import carried_over  # noqa: E402
+from minimax_cal.robots.mjcf_import import read_mujoco_model  # noqa: E402
+from minimax_cal.simulators import gap as gap_module  # noqa: E402
+from minimax_cal.simulators.chain import find_model_arm  # noqa: E402
+from minimax_cal.simulators.gap import carry_terms_to_known_masses  # noqa: E402
 
 AGREES = 0.01  # between simulator and fit, held-out RMS [mm]
 PLACED = 0.15  # of an error that the poses it is judged by have placed
@@ -40,7 +40,7 @@ BEFORE = ["as given", "servo sag removed", "calibrated geometry"]  # names of th
 def few_moves() -> Iterator[None]:
     """Two dozen training poses place base and targets: every pose is a move of seconds."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ladder, "TRAINING", 24)
+        patch.setattr(gap_module, "MAX_TRAINING_POSES", 24)
         yield
 
 
@@ -49,8 +49,8 @@ def arm(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A published-like model, poses that its real twin took, and a fit of them."""
     folder = tmp_path_factory.mktemp("arm")
     robot = mc.load_robot("ur10")
-    given = read_model(published_like(folder, robot))
-    weighs = chain_of(given.compiled(), 6, given.source).robot
+    given = read_mujoco_model(published_like(folder, robot))
+    weighs = find_model_arm(given.compile_model(), 6, given.source).robot
     truth = mc.Truth(compliance=3e-6)
     mc.write_measurements(folder / "poses.csv", mc.simulate(weighs, 60, seed=3, truth=truth).data)
     fit = mc.calibrate(robot, folder / "poses.csv", "sum", effects="joint_compliance:all")
@@ -88,12 +88,12 @@ def test_the_corrected_file_reproduces_the_last_rung(arm, gap):
 def test_a_report_tells_that_the_simulator_met_another_arm(arm, gap):
     pytest.importorskip("plotly")
     fit = mc.load_fit(arm / "fit.json")
-    assert read_sources([fit, gap]).notices == ()
+    assert read_report_sources([fit, gap]).notices == ()
     here = replace(gap.provenance, data_sha256="0" * 64)
     new = replace(gap, robot=fit.robot.name, provenance=here)
-    (notice,) = read_sources([fit, new]).notices
+    (notice,) = read_report_sources([fit, new]).notices
     assert "measurements" in notice
-    (notice,) = read_sources([fit, replace(new, robot="another")]).notices
+    (notice,) = read_report_sources([fit, replace(new, robot="another")]).notices
     assert "another" in notice
     assert fit.robot.name in notice
 
@@ -142,7 +142,7 @@ def test_models_that_do_not_fit_are_refused(arm, tmp_path, capsys):
 
 @pytest.mark.slow  # the quick studies run it besides
 def test_the_study_in_its_quick_form():
-    result = study.run(study.Trial("ur10", 48, 0))
+    result = study.run_trial(study.SimulatorTrial("ur10", 48, 0))
     for rung in result.gap.rungs[2:]:
         assert abs(rung.holdout_rms_mm - rung.predicted_rms_mm) < AGREES
     assert abs(result.alone_mm - result.gap.rungs[-1].holdout_rms_mm) < AGREES
@@ -152,13 +152,13 @@ def test_the_study_in_its_quick_form():
 def stiffening(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An arm whose second joint gives way to light loads most, which no spring does, and a fit."""
     folder = tmp_path_factory.mktemp("stiffening")
-    robot = study.weighed(mc.load_robot("irb2600"))
+    robot = study.add_light_masses(mc.load_robot("irb2600"))
     rng = np.random.default_rng(0)
     plain = mc.simulate(robot, 3, seed=0, truth=mc.Truth(noise=0.0)).cell
-    q = random_poses(robot, 100, rng, 2.0)
+    q = random_joint_values_above_floor(robot, 100, rng, 2.0)
     effects = ("joint_compliance:all", "joint_compliance:J2:within=60", "base_flex:frame")
-    scene = plain.scene(mc.measurements(q, plain.predict(q)))
-    found = terms(scene, effects)
+    scene = plain.pose_arm(mc.measurements(q, plain.predict(q)))
+    found = parse_effect_terms(scene, effects)
     sizes = (3e-6, 1e-5, 5e-7)
     values = tuple(
         np.full(len(t.columns(scene).names), c) for t, c in zip(found, sizes, strict=True)
@@ -175,7 +175,9 @@ def stiffening(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_an_effect_without_an_element_is_no_rung_and_what_was_fitted_beside_it_is_not_used(
     stiffening, monkeypatch
 ):
-    monkeypatch.setattr(ladder, "TRAINING", 100)  # what is left is much more than noise
+    monkeypatch.setattr(
+        gap_module, "MAX_TRAINING_POSES", 100
+    )  # what is left is much more than noise
     written = stiffening / "corrected.xml"
     ways = {"data": stiffening / "poses.csv", "fit": stiffening / "fit.json"}
     gap = mc.simulator_gap(stiffening / "arm.xml", **ways, write=written)
@@ -187,7 +189,7 @@ def test_an_effect_without_an_element_is_no_rung_and_what_was_fitted_beside_it_i
     assert gap.commands.holdout_rms_mm < 0.7 * held[-1]
     for rung in (*gap.rungs[2:], gap.commands):
         assert abs(rung.holdout_rms_mm - rung.predicted_rms_mm) < AGREES
-    assert not ladder.disagreement([*gap.rungs, gap.commands])
+    assert not gap_module.list_disagreements_with_fits([*gap.rungs, gap.commands])
     # the model that is driven with the map is another file than the best one without
     commands = mc.load_commands(stiffening / "corrected.commands.json")
     fit = mc.load_fit(stiffening / "fit.json")
@@ -215,9 +217,9 @@ def driven(path: Path, fit: mc.Fit, asked: Callable[[np.ndarray], np.ndarray]) -
 
 
 def test_what_makes_the_simulator_worse_is_not_written(stiffening, tmp_path, monkeypatch):
-    monkeypatch.setattr(ladder, "TRAINING", 12)
-    monkeypatch.setattr(ladder, "WORSE", -0.9)  # no rung is so much better
-    monkeypatch.setattr(ladder, "AGREES_MM", -1.0)
+    monkeypatch.setattr(gap_module, "MAX_TRAINING_POSES", 12)
+    monkeypatch.setattr(gap_module, "MAX_RELATIVE_ERROR_RISE", -0.9)  # no rung is so much better
+    monkeypatch.setattr(gap_module, "MAX_FORMULA_DISAGREEMENT_MM", -1.0)
     gap = mc.simulator_gap(
         stiffening / "arm.xml", stiffening / "poses.csv", fit=stiffening / "fit.json",
         write=tmp_path / "corrected.xml",
@@ -231,10 +233,14 @@ def test_what_makes_the_simulator_worse_is_not_written(stiffening, tmp_path, mon
 
 
 def test_a_simulator_that_does_other_than_the_fit_says_so():
-    rung = Rung("+ base_flex frame", 0.0950, 0.3, 0.0950, 0.3, 0.0, predicted_rms_mm=0.0800)
-    (said,) = ladder.disagreement([rung, replace(rung, predicted_rms_mm=0.0900)])
+    rung = GapStep("+ base_flex frame", 0.0950, 0.3, 0.0950, 0.3, 0.0, predicted_rms_mm=0.0800)
+    (said,) = gap_module.list_disagreements_with_fits(
+        [rung, replace(rung, predicted_rms_mm=0.0900)]
+    )
     assert all(fact in said for fact in ("base flex", "0.0950 mm", "0.0800 mm"))
-    assert not ladder.disagreement([replace(rung, predicted_rms_mm=float("nan"))])
+    assert not gap_module.list_disagreements_with_fits(
+        [replace(rung, predicted_rms_mm=float("nan"))]
+    )
 
 
 @pytest.mark.slow
@@ -251,19 +257,19 @@ def test_real_arms_end_where_effects_with_an_element_end(name, tmp_path):
 
 def test_laws_chosen_for_guessed_masses_are_chosen_anew_for_told_ones():
     told = mc.load_robot("irb2600")
-    mass, com = tubes(told.mdh)
+    mass, com = assumed_link_masses_and_centres(told.mdh)
     told = replace(told, mass=np.maximum(mass, 1.0), com=com)
     soft = Term("joint_compliance", "J2", {"parts": 128.0, "within": 9.0, "assumed": 1.0})
     every = Term("joint_compliance", "all", {"parts": 112.0})
     sag = Term("link_bending", "L2", {"tool": 1.0})
     known = Term("joint_compliance", "J3", {"parts": 2048.0, "within": 9.0})
-    new = carried_over((soft, every, sag, known), told)
+    new = carry_terms_to_known_masses((soft, every, sag, known), told)
     assert [(t.label, dict(t.choice)) for t in new] == [
         ("joint_compliance:all", {}), ("joint_compliance:J2", {}), ("link_bending:L2", {}),
         (known.label, dict(known.choice)),
     ]  # fmt: skip
-    assert carried_over((known, soft), mc.load_robot("irb2600")) == (known, soft)
-    assert carried_over((known,), told) == (known,)
+    assert carry_terms_to_known_masses((known, soft), mc.load_robot("irb2600")) == (known, soft)
+    assert carry_terms_to_known_masses((known,), told) == (known,)
 
 
 POST = "<geom name='pillar' type='capsule' size='.03 .6' pos='.45 0 .5'/>"
@@ -288,8 +294,8 @@ def beside_a_pillar(pillar: str = POST, servo: str = "position kp='3000' kv='90'
 
 
 def robot_of(path: Path) -> mc.Robot:
-    given = read_model(path)
-    return chain_of(given.compiled(), 3, given.source).robot
+    given = read_mujoco_model(path)
+    return find_model_arm(given.compile_model(), 3, given.source).robot
 
 
 @pytest.fixture(scope="module")
@@ -309,7 +315,7 @@ def turned(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, mc.Measureme
         assert bool(data.ncon) == (row < 3)
         y[row] = data.xpos[3] + spots @ data.xmat[3].reshape(3, 3).T
     (folder / "arm.xml").write_text(beside_a_pillar())
-    rows = still(q, ("smr1", "smr2"), robot_of(folder / "arm.xml"))
+    rows = build_measurements_at_rest(q, ("smr1", "smr2"), robot_of(folder / "arm.xml"))
     y += 1e-5 * rng.normal(size=y.shape)
     return folder, replace(rows, y=y, source="poses.csv")
 

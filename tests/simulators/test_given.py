@@ -10,15 +10,15 @@ import pytest
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.modelling.cell import still
-from minimax_cal.modelling.effects.table import Fitted, terms
-from minimax_cal.robots.mjcf import read_model
+from minimax_cal.modelling.cell import build_measurements_at_rest
+from minimax_cal.modelling.effects.table import Fitted, parse_effect_terms
+from minimax_cal.robots.mjcf_import import read_mujoco_model
 from tests.problems_mjcf import published_like
 
 mujoco = pytest.importorskip("mujoco", reason="needs mujoco: pip install minimax-cal[mujoco]")
 
-from minimax_cal.simulators.chain import Chain, chain_of  # noqa: E402
-from minimax_cal.simulators.drive import drive, placed_error  # noqa: E402
+from minimax_cal.simulators.chain import ModelArm, find_model_arm  # noqa: E402
+from minimax_cal.simulators.drive import compute_error_with_fitted_base, drive_to_poses  # noqa: E402
 
 EXACT = dict(rtol=0, atol=1e-9)  # [m]
 FIRST_ORDER = 5e-6  # what the laws of a fit leave out: sag of sag [m]
@@ -34,9 +34,9 @@ def joints(robot: mc.Robot, count: int = 12) -> np.ndarray:
 
 
 @pytest.fixture
-def given(tmp_path: Path) -> tuple[Path, Chain]:
+def given(tmp_path: Path) -> tuple[Path, ModelArm]:
     path = published_like(tmp_path, mc.load_robot("ur10"))
-    return path, chain_of(read_model(path).compiled(), 6, str(path))
+    return path, find_model_arm(read_mujoco_model(path).compile_model(), 6, str(path))
 
 
 def bent_cell(robot: mc.Robot, texts: dict[str, list[float]]) -> mc.Cell:
@@ -45,31 +45,33 @@ def bent_cell(robot: mc.Robot, texts: dict[str, list[float]]) -> mc.Cell:
     mdh[:5] += 1e-3 * np.random.default_rng(1).normal(size=(5, 5))
     spots = np.array([[0.1, 0.0, 0.03], [-0.05, 0.08, 0.03], [-0.05, -0.08, 0.03]])
     cell = mc.Cell(robot.with_mdh(mdh), np.eye(4), ("smr1", "smr2", "smr3"), spots)
-    scene = cell.scene(still(joints(robot), cell.target_names, robot))
-    chosen = terms(scene, list(texts))
+    scene = cell.pose_arm(build_measurements_at_rest(joints(robot), cell.target_names, robot))
+    chosen = parse_effect_terms(scene, list(texts))
     values = tuple(np.array(v) for v in texts.values())
     return replace(cell, effects=Fitted(chosen, values))
 
 
-def corrected(path: Path, chain: Chain, cell: mc.Cell, out: Path) -> Any:
-    from minimax_cal.correcting.export import written
-    from minimax_cal.correcting.exporters.job import job_of
+def corrected(path: Path, chain: ModelArm, cell: mc.Cell, out: Path) -> Any:
+    from minimax_cal.compensation.exporters.export_job import build_export_job
+    from minimax_cal.compensation.robot_export import write_exported_files
     from minimax_cal.simulators.mjcf import write
 
-    job = replace(job_of("cell", cell), nominal=chain.robot, fitted=True, model=path, path=out)
-    written(write(job), out)
+    job = replace(
+        build_export_job("cell", cell), nominal=chain.robot, fitted=True, model=path, path=out
+    )
+    write_exported_files(write(job), out)
     return mujoco.MjModel.from_xml_path(str(out))
 
 
-def sites(model: Any, chain: Chain, q: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
+def sites(model: Any, chain: ModelArm, q: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
     """The sites where the model comes to rest, in the robot's base frame."""
-    ids = tuple(model.joint(name).id for name in chain.names)
-    moved, data, out = replace(chain, model=model, joints=ids), mujoco.MjData(model), []
+    ids = tuple(model.joint(name).id for name in chain.joint_names)
+    moved, data, out = replace(chain, model=model, joint_ids=ids), mujoco.MjData(model), []
     for row in q:
         mujoco.mj_resetData(model, data)
         for i, joint in enumerate(ids):
             data.qpos[model.jnt_qposadr[joint]] = row[i]
-            data.ctrl[moved.servos[i]] = row[i]
+            data.ctrl[moved.servo_ids[i]] = row[i]
         while data.time < 8.0:
             mujoco.mj_step(model, data, 100)
             if np.abs(data.qvel).max() < 1e-7:
@@ -82,16 +84,16 @@ def sites(model: Any, chain: Chain, q: np.ndarray, names: tuple[str, ...]) -> np
 def test_the_robot_of_a_model_moves_as_the_model_does(given):
     _, chain = given
     model, data = chain.model, mujoco.MjData(chain.model)
-    assert chain.names == tuple(f"axis{i}" for i in range(6))
+    assert chain.joint_names == tuple(f"axis{i}" for i in range(6))
     nominal = mc.load_robot("ur10")
     q = joints(nominal)
     frame = []
     for row in q:
-        for i, joint in enumerate(chain.joints):
+        for i, joint in enumerate(chain.joint_ids):
             data.qpos[model.jnt_qposadr[joint]] = row[i]
         mujoco.mj_kinematics(model, data)
         frame.append(data.body("part5").xpos.copy())
-    ours = (chain.base @ chain.robot.pose(q) @ chain.seen.tool)[:, :3, 3]
+    ours = (chain.base @ chain.robot.pose(q) @ chain.urdf_robot.tool)[:, :3, 3]
     assert_allclose(ours, frame, **EXACT)
     assert_allclose(chain.robot.up, [0.0, 0.0, 1.0], atol=1e-12)
 
@@ -103,15 +105,17 @@ def test_a_timestep_that_takes_forever_is_refused(given, tmp_path, step):
         option.set("timestep", step)
     tree.write(tmp_path / "slow.xml")
     with pytest.raises(mc.RobotError, match=rf"slow\.xml: its timestep of {float(step):g} s"):
-        chain_of(read_model(tmp_path / "slow.xml").compiled(), 6, str(tmp_path / "slow.xml"))
+        find_model_arm(
+            read_mujoco_model(tmp_path / "slow.xml").compile_model(), 6, str(tmp_path / "slow.xml")
+        )
 
 
 def test_everything_stays_but_what_was_corrected(given, tmp_path):
     path, chain = given
     cell = bent_cell(chain.robot, {"joint_compliance:all": [2e-6] * 5, "encoder_gain:J4": [1e-3]})
     corrected(path, chain, cell, tmp_path / "out.xml")
-    before = read_model(path).document.root
-    after = read_model(tmp_path / "out.xml").document.root
+    before = read_mujoco_model(path).document.root
+    after = read_mujoco_model(tmp_path / "out.xml").document.root
     own = {"smr1", "smr2", "smr3", "flange"}
     for parent in list(after.iter("body")):
         for site in [e for e in parent.findall("site") if e.get("name") in own]:
@@ -165,20 +169,20 @@ def test_a_corrected_model_rests_where_the_fit_says(given, tmp_path, name):
 def test_published_gains_sag(given):
     _, chain = given
     q = joints(chain.robot, 6)
-    rested = drive(chain, q, str(given[0]))
-    assert (chain.servos >= 0).all()
-    assert not rested.moving.any()
+    rested = drive_to_poses(chain, q, str(given[0]))
+    assert (chain.servo_ids >= 0).all()
+    assert not rested.is_moving.any()
     # the servo is a spring: each joint stands off by its torque over its gain
     torque = still_torque(chain, rested.q)
-    gains = np.array(chain.model.actuator_gainprm[chain.servos, 0])
+    gains = np.array(chain.model.actuator_gainprm[chain.servo_ids, 0])
     assert_allclose(rested.q - q, torque / gains, rtol=0, atol=2e-5)  # its slowest pole is at 5/s
 
 
-def still_torque(chain: Chain, q: np.ndarray) -> np.ndarray:
+def still_torque(chain: ModelArm, q: np.ndarray) -> np.ndarray:
     """Gravity's torque by MuJoCo's own inverse dynamics."""
     data, out = mujoco.MjData(chain.model), []
-    at = [int(chain.model.jnt_qposadr[j]) for j in chain.joints]
-    dofs = [int(chain.model.jnt_dofadr[j]) for j in chain.joints]
+    at = [int(chain.model.jnt_qposadr[j]) for j in chain.joint_ids]
+    dofs = [int(chain.model.jnt_dofadr[j]) for j in chain.joint_ids]
     for row in q:
         data.qpos[at] = row
         mujoco.mj_forward(chain.model, data)
@@ -196,7 +200,9 @@ def test_base_and_targets_are_found_from_poses():
     start[:3, 3] += 0.02
     train = np.arange(30) < 20
     poses = cell.robot.pose(simulation.data.q)
-    error = placed_error(poses, simulation.data, train, (start, cell.target_positions + 0.01))
+    error = compute_error_with_fitted_base(
+        poses, simulation.data, train, (start, cell.target_positions + 0.01)
+    )
     assert_allclose(error, 0.0, **EXACT)
 
 
@@ -219,6 +225,6 @@ def test_models_that_no_memory_holds_are_refused(tmp_path, before, within, says)
     file = tmp_path / "bad.xml"
     file.write_text(f"<mujoco>{before}<worldbody>{within}</worldbody></mujoco>")
     with pytest.raises(mc.CalibrationError) as caught:
-        read_model(file)
+        read_mujoco_model(file)
     assert str(caught.value).startswith(f"{file}: ")
     assert says in str(caught.value)

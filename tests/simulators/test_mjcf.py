@@ -10,14 +10,18 @@ import pytest
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.correcting.export import exported, written
-from minimax_cal.correcting.exporters.job import compliance_of, job_of, origins
-from minimax_cal.modelling.cell import Cell, still
-from minimax_cal.modelling.effects.table import Fitted, terms
-from minimax_cal.robots.gravity import tubes
+from minimax_cal.compensation.exporters.export_job import (
+    build_export_job,
+    joint_compliances,
+    joint_origins,
+)
+from minimax_cal.compensation.robot_export import build_export, write_exported_files
+from minimax_cal.modelling.cell import Cell, build_measurements_at_rest
+from minimax_cal.modelling.effects.table import Fitted, parse_effect_terms
+from minimax_cal.robots.gravity_torques import assumed_link_masses_and_centres
 from minimax_cal.robots.robot import robot_from_dict
-from minimax_cal.simulators.arm import arm_of
-from minimax_cal.simulators.elements import across_themselves
+from minimax_cal.simulators.arm import build_simulated_arm
+from minimax_cal.simulators.elements import find_axes_orthogonal_to_their_images
 from minimax_cal.simulators.mjcf import write
 from tests.conftest import run
 
@@ -49,7 +53,7 @@ def robot_called(name: str) -> mc.Robot:
 
 
 def with_masses(robot: mc.Robot) -> mc.Robot:
-    mass, com = tubes(robot.mdh)
+    mass, com = assumed_link_masses_and_centres(robot.mdh)
     return replace(robot, mass=np.maximum(0.4 * mass, 0.5), com=com)
 
 
@@ -65,8 +69,8 @@ def cell_with(robot: mc.Robot, *texts: str, size: float = 2e-6, **values: list[f
     base = np.eye(4)
     base[:3, 3] = 1.0, 2.0, 0.5
     cell = Cell(robot, base, ("smr1", "smr2", "smr3"), SPOTS)
-    scene = cell.scene(still(poses(robot), cell.target_names, robot))
-    chosen = terms(scene, texts)
+    scene = cell.pose_arm(build_measurements_at_rest(poses(robot), cell.target_names, robot))
+    chosen = parse_effect_terms(scene, texts)
     found = [
         np.array(values[t.effect]) if t.effect in values
         else size * np.linspace(0.8, 1.2, len(t.columns(scene).names))
@@ -76,7 +80,7 @@ def cell_with(robot: mc.Robot, *texts: str, size: float = 2e-6, **values: list[f
 
 
 def model_of(cell: Cell) -> Any:
-    text = write(job_of("cell", cell)).content.decode()
+    text = write(build_export_job("cell", cell)).content.decode()
     return mujoco.MjModel.from_xml_string(text)
 
 
@@ -145,10 +149,10 @@ def test_each_element_does_what_its_law_says(text):
     name = text.split(":")[0]
     if name == "backlash":
         cell = cell_with(robot)
-        data = replace(still(poses(robot), cell.target_names, robot))
+        data = replace(build_measurements_at_rest(poses(robot), cell.target_names, robot))
         data = replace(data, columns={**data.columns, "approach2": np.resize([1.0, -1.0], 8),
                                       "approach5": np.resize([1.0, -1.0], 8)})  # fmt: skip
-        term = terms(cell.scene(data), [text])
+        term = parse_effect_terms(cell.pose_arm(data), [text])
         cell = replace(cell, effects=Fitted(term, (np.array([1e-4, -2e-4]),)))
         model = model_of(cell)
         for joint, width in ((2, 1e-4), (5, -2e-4)):
@@ -177,8 +181,8 @@ def test_all_effects_at_once_on_arms_of_unknown_masses(name):
         robot, "joint_compliance:all", "base_flex:frame", "encoder_gain:all", size=1.5e-6,
         base_flex=[2e-7], encoder_gain=(2e-4 * np.ones(robot.joints)).tolist(),
     )  # fmt: skip
-    arm = arm_of(cell)
-    assert arm.remainder < IMITATED
+    arm = build_simulated_arm(cell)
+    assert arm.remaining_rms < IMITATED
     off = rested(model_of(cell), poses(robot), cell.target_names) - in_base(cell, poses(robot))
     assert np.sqrt((off**2).sum(axis=-1).mean()) < IMITATED
 
@@ -186,7 +190,10 @@ def test_all_effects_at_once_on_arms_of_unknown_masses(name):
 def test_a_gain_that_carries_a_deflection_says_so():
     """The compliance that is said is the law's: that of the gain under its share of gravity."""
     cell = cell_with(with_masses(robot_called("irb2600")), "joint_compliance:all")
-    text, ((_, compliance),) = write(job_of("cell", cell)).content.decode(), cell.effects.pairs
+    text, ((_, compliance),) = (
+        write(build_export_job("cell", cell)).content.decode(),
+        cell.effects.terms_with_values,
+    )
     model = mujoco.MjModel.from_xml_string(text)
     texts = {element.get("name"): element.get("data", "")
              for element in ElementTree.fromstring(text).iter("text")}  # fmt: skip
@@ -221,38 +228,38 @@ def test_turns_without_an_element_go_into_the_commands(tmp_path):
     other.write_text('{"kind": "calibration"}')
     with pytest.raises(mc.CalibrationError, match="is no command map"):
         mc.load_commands(other)
-    made = exported(cell, "mjcf")
+    made = build_export(cell, "mjcf")
     with pytest.raises(mc.OptionError, match="beside it"):
-        written(made.file, None)
+        write_exported_files(made.file, None)
 
 
 def test_a_joint_that_stiffens_goes_into_the_commands_and_not_into_springs():
     robot = with_masses(robot_called("irb2600"))
     cell = cell_with(robot, "joint_compliance:J2:within=20", joint_compliance=[3e-6])
-    arm = arm_of(cell)
-    assert [term.label for term in arm.mapped.terms] == ["joint_compliance:J2"]
-    assert not arm.turn.any()
-    assert np.isnan(compliance_of(cell)[1])  # one number does not tell it
+    arm = build_simulated_arm(cell)
+    assert [term.label for term in arm.mapped_effects.terms] == ["joint_compliance:J2"]
+    assert not arm.joint_compliance.any()
+    assert np.isnan(joint_compliances(cell)[1])  # one number does not tell it
     plain = cell_with(robot, "joint_compliance:J2", joint_compliance=[3e-6])
-    assert compliance_of(plain)[1] == 3e-6
+    assert joint_compliances(plain)[1] == 3e-6
 
 
 def test_links_that_bend_under_a_tool_nobody_told_have_one_spring():
     robot = robot_called("irb2600")
     cell = cell_with(robot, "link_bending:L2:tool=1", link_bending=[1e-6, 2e-6])
-    arm = arm_of(cell)
-    assert list(arm.bend) == [1]
-    assert arm.remainder < IMITATED
+    arm = build_simulated_arm(cell)
+    assert list(arm.link_flexibility) == [1]
+    assert arm.remaining_rms < IMITATED
 
 
 def test_what_changes_with_time_is_named():
     robot = with_masses(mc.load_robot("irb120"))
     cell = cell_with(robot)
-    data = still(poses(robot), cell.target_names, robot)
+    data = build_measurements_at_rest(poses(robot), cell.target_names, robot)
     data = replace(data, columns={**data.columns, "clock": np.linspace(0.0, 1.0, data.poses)})
-    drift = terms(cell.scene(data), ["frame_drift:frame:constant=0.5"])
+    drift = parse_effect_terms(cell.pose_arm(data), ["frame_drift:frame:constant=0.5"])
     cell = replace(cell, effects=Fitted(drift, (np.full(6, 1e-4),)))
-    made = write(job_of("cell", cell))
+    made = write(build_export_job("cell", cell))
     assert any("frame drift" in text and "time" in text for text in made.notices)
     assert not made.beside
 
@@ -260,7 +267,7 @@ def test_what_changes_with_time_is_named():
 def test_a_basis_across_itself_is_found():
     matrix = np.random.default_rng(3).normal(size=(3, 3))
     matrix -= np.trace(matrix) / 3.0 * np.eye(3)
-    basis = across_themselves(matrix)
+    basis = find_axes_orthogonal_to_their_images(matrix)
     assert_allclose(basis @ basis.T, np.eye(3), atol=1e-12)
     assert_allclose(np.diag(basis @ matrix @ basis.T), 0.0, atol=1e-12)
 
@@ -297,7 +304,7 @@ def test_simulators_load_every_urdf(name):
 
 def fixed_tip(robot: mc.Robot) -> np.ndarray:
     """From the last moving link to the flange, as the file has it."""
-    return np.asarray(origins(robot)[-1])
+    return np.asarray(joint_origins(robot)[-1])
 
 
 def test_assumed_masses_do_not_come_back_as_known(tmp_path):

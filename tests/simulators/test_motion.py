@@ -10,10 +10,10 @@ import pytest
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.dynamics.given import MotionKnown, Payload, read_logs
-from minimax_cal.dynamics.logs import runs_text
-from minimax_cal.dynamics.logs.table import NOTHING, Run
-from minimax_cal.dynamics.regressor import link_parameters
+from minimax_cal.dynamics.known_inputs import MotionKnown, Payload, read_runs_of_robot
+from minimax_cal.dynamics.logs import format_runs_csv
+from minimax_cal.dynamics.logs.log_table import NO_TORQUE_UNIT, Run
+from minimax_cal.dynamics.regressor import compute_link_inertial_parameters
 from tests.conftest import run
 from tests.dynamics.motions import run_of, three_joints
 from tests.problems_mjcf import drive_alone
@@ -23,25 +23,29 @@ mujoco = pytest.importorskip("mujoco", reason="needs mujoco: pip install minimax
 
 from experiments.driven_arms import (  # noqa: E402
     DrivenArm,
-    Withheld,
-    commands,
-    drive_along,
-    logged,
-    save_model,
-    with_motors,
+    WithheldEffects,
+    build_motor_model_xml,
+    draw_commanded_motion,
+    simulate_controlled_run,
+    simulate_logs,
+    write_model_file,
 )
-from minimax_cal.simulators.motion import numbers as bodies  # noqa: E402
-from minimax_cal.simulators.motion.fit import least_within, levelling, speeds  # noqa: E402
+from minimax_cal.simulators.motion import model_parameters as bodies  # noqa: E402
+from minimax_cal.simulators.motion.fit import (  # noqa: E402
+    levelling_damping_coefficients,
+    minimise_squares_with_bounds,
+    speed_powers,
+)
 from minimax_cal.simulators.motion.judge import (  # noqa: E402
-    OWN_SERVOS,
-    Judge,
-    follow_commands,
+    OWN_SERVOS_TEXT,
+    MotionJudge,
+    simulate_commands,
 )
-from minimax_cal.simulators.motion.numbers import open_model  # noqa: E402
+from minimax_cal.simulators.motion.model_parameters import open_model  # noqa: E402
 from minimax_cal.simulators.result import MotionGap  # noqa: E402
 
 STEP = 0.002
-LACKS = Withheld(
+LACKS = WithheldEffects(
     friction=np.array([4.0, 3.0, 1.5]),
     damping=np.array([3.0, 4.0, 1.0]),
     armature=np.array([0.4, 0.5, 0.3]),
@@ -53,7 +57,7 @@ LEFT, LEFT_TORQUE = 0.12, 0.15  # of the joint error, of the worst joint's torqu
 
 def errors(arm: DrivenArm, model: object, real: object) -> tuple[float, np.ndarray]:
     """Joint error [rad] and torques of the joints that differ from the real arm's, RMS."""
-    course = drive_along(arm, model, commands(arm, 77, 1.1), 5.0)
+    course = simulate_controlled_run(arm, model, draw_commanded_motion(arm, 77, 1.1), 5.0)
     off, torque = course.q - real.q, course.torque - real.torque
     return float(np.sqrt((off**2).mean())), np.sqrt((torque**2).mean(axis=0))
 
@@ -63,13 +67,15 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     """An arm, its logs, and the gap that the command closes."""
     folder = tmp_path_factory.mktemp("motion")
     robot = three_joints()
-    xml = with_motors(robot).replace(b"<worldbody>", b"<!-- as drawn -->\n  <worldbody>", 1)
+    xml = build_motor_model_xml(robot).replace(
+        b"<worldbody>", b"<!-- as drawn -->\n  <worldbody>", 1
+    )
     arm = DrivenArm(robot, xml, LACKS, 3, STEP)
-    model = save_model(arm, folder)
+    model = write_model_file(arm, folder)
     logs = []
-    for one in logged(arm, 3, 8.0):
+    for one in simulate_logs(arm, 3, 8.0):
         path = folder / f"{one.name}.csv"
-        path.write_text(runs_text([one], np.zeros(3, dtype=bool)))
+        path.write_text(format_runs_csv([one], np.zeros(3, dtype=bool)))
         logs.append(path)
     out, text = folder / "corrected.xml", folder / "gap.json"
     figure = folder / "gap.png"
@@ -81,7 +87,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
 
 
 def test_the_file_has_the_numbers_of_the_real_arm(made):
-    found, real = mujoco.MjModel.from_xml_path(str(made.out)), made.arm.real()
+    found, real = mujoco.MjModel.from_xml_path(str(made.out)), made.arm.compile_real_arm()
     assert_allclose(found.dof_frictionloss[[0, 2]], LACKS.friction[[0, 2]], rtol=0.05)
     assert_allclose(found.dof_damping[[0, 2]], LACKS.damping[[0, 2]], rtol=0.1)
     assert_allclose(found.dof_armature[1:], real.dof_armature[1:], rtol=0.1)
@@ -92,8 +98,10 @@ def test_the_file_has_the_numbers_of_the_real_arm(made):
 
 def test_it_moves_as_the_arm_does(made):
     """On a run that no log holds, under a controller that knows the first file."""
-    arm, before = made.arm, made.arm.known
-    real = drive_along(arm, arm.real(), commands(arm, 77, 1.1), 5.0, LACKS)
+    arm, before = made.arm, made.arm.compiled_file_model
+    real = simulate_controlled_run(
+        arm, arm.compile_real_arm(), draw_commanded_motion(arm, 77, 1.1), 5.0, LACKS
+    )
     first = errors(arm, before, real)
     plain = errors(arm, mujoco.MjModel.from_xml_path(str(made.out)), real)
     assert plain[0] < LEFT * first[0]
@@ -128,7 +136,7 @@ def test_a_plain_file_has_nothing_that_others_leave_out(made,
     model, bent = mujoco.MjModel.from_xml_path(str(out)), ("dof_dampingpoly", "jnt_stiffnesspoly")
     assert not any(np.any(getattr(model, name, 0.0)) for name in bent)
     assert_allclose(
-        reached(out, read_logs(made.model, made.logs)), gap.rungs[-1].torque_rms, rtol=1e-4
+        reached(out, read_runs_of_robot(made.model, made.logs)), gap.rungs[-1].torque_rms, rtol=1e-4
     )
 
 
@@ -155,12 +163,12 @@ def test_a_plain_file_moves_alike_in_every_simulator(made, tmp_path):
 def reached(path: Path, runs: list[Run], payload: Payload | None = None) -> np.ndarray:
     """(n,) RMS torque that a file misses on the last run, loaded again [N m]."""
     opened = open_model(path, 3)
-    judge = Judge.of(opened, runs, MotionKnown(payload=payload))
-    return np.array(judge.torque(opened.chain).whole)
+    judge = MotionJudge.from_runs(opened, runs, MotionKnown(payload=payload))
+    return np.array(judge.measure_torque_error(opened.chain).all_rows)
 
 
 def test_a_file_reaches_the_last_rung(made):
-    runs = read_logs(made.model, made.logs)
+    runs = read_runs_of_robot(made.model, made.logs)
     assert_allclose(reached(made.out, runs), made.gap.rungs[-1].torque_rms, rtol=1e-4)
 
 
@@ -169,7 +177,7 @@ def test_a_drive_gain_that_no_file_holds_is_in_no_figure(made, tmp_path):
     robot, out = tmp_path / "robot.json", tmp_path / "out.xml"
     robot.write_text(json.dumps(three_joints().to_dict()))
     runs = [replace(run, torque=run.torque * [1.0, 1.17, 1.0])
-            for run in read_logs(made.model, made.logs)]  # fmt: skip
+            for run in read_runs_of_robot(made.model, made.logs)]  # fmt: skip
     payload = (LACKS.payload, (0.02, 0.0, 0.06))
     new = mc.motion_gap(robot, runs, payload=payload, write=out, driven=False)
     assert any("drive gain" in text and "joint 2" in text for text in new.left_out)
@@ -201,9 +209,9 @@ def test_the_text_stays_but_for_what_changes(made):
 
 
 def test_an_arm_as_drawn_keeps_its_file(tmp_path):
-    nothing = Withheld(*np.zeros((4, 3)))
-    arm = DrivenArm(three_joints(), with_motors(three_joints()), nothing, 5, STEP)
-    gap = mc.motion_gap(save_model(arm, tmp_path), logged(arm, 2, 8.0), driven=False,
+    nothing = WithheldEffects(*np.zeros((4, 3)))
+    arm = DrivenArm(three_joints(), build_motor_model_xml(three_joints()), nothing, 5, STEP)
+    gap = mc.motion_gap(write_model_file(arm, tmp_path), simulate_logs(arm, 2, 8.0), driven=False,
                         write=tmp_path / "same.xml")  # fmt: skip
     assert gap.elements == ()
     assert len(gap.rungs) == 1
@@ -259,7 +267,7 @@ def test_a_static_calibration_goes_into_the_same_file(made, tmp_path):
 def test_logged_commands_drive_the_servos_of_the_model(tmp_path):
     """A real arm with the servos of its model, friction and late commands, driven by its log."""
     robot = three_joints()
-    xml = with_motors(robot).decode().replace("<motor ", '<position kp="2000" kv="200" ')
+    xml = build_motor_model_xml(robot).decode().replace("<motor ", '<position kp="2000" kv="200" ')
     path = tmp_path / "servos.xml"
     path.write_text(xml)
     real = mujoco.MjModel.from_xml_path(str(path))
@@ -267,7 +275,7 @@ def test_logged_commands_drive_the_servos_of_the_model(tmp_path):
     arm = DrivenArm(robot, xml.encode(), LACKS, 3, STEP)
     rows = []
     for number in range(2):
-        at = commands(arm, number, 0.5 + 0.5 * number)(STEP * np.arange(4000))[0]
+        at = draw_commanded_motion(arm, number, 0.5 + 0.5 * number)(STEP * np.arange(4000))[0]
         data = mujoco.MjData(real)
         data.qpos[:] = at[0]
         out = np.empty((len(at), 10))
@@ -285,7 +293,7 @@ def test_logged_commands_drive_the_servos_of_the_model(tmp_path):
         text = "\n".join(",".join(f"{v:.9g}" for v in row) for row in table)
         files[-1].write_text(",".join(header) + "\n" + text + "\n")
     gap = mc.motion_gap(path, files)
-    assert gap.drives == OWN_SERVOS
+    assert gap.drives == OWN_SERVOS_TEXT
     first, last = (np.array(r.tracking_rms_mrad) for r in (gap.rungs[0], gap.rungs[-1]))
     assert (last < 0.1 * first).all()
 
@@ -295,12 +303,12 @@ def test_a_delayed_servo_at_its_command_stays_there(tmp_path):
     """MuJoCo fills the history of a delayed command with 0: the arm would jump towards it."""
     servo = '<position kp="2000" kv="200" delay="0.02" nsample="14" '
     path, q = tmp_path / "late.xml", np.array([0.4, -0.3, 0.5])
-    path.write_text(with_motors(three_joints()).decode().replace("<motor ", servo))
+    path.write_text(build_motor_model_xml(three_joints()).decode().replace("<motor ", servo))
     chain, time = open_model(path, 3).chain, np.arange(0.0, 0.5, 0.01)
     chain.model.opt.gravity[:] = 0.0
     still = np.broadcast_to(q, (len(time), 3))
     log = run_of("still", time, still, 0.0 * still)
-    assert_allclose(follow_commands(chain, log, still, str(path)), still, atol=1e-9)
+    assert_allclose(simulate_commands(chain, log, still, str(path)), still, atol=1e-9)
 
 
 FILTERED = (
@@ -313,15 +321,15 @@ FILTERED = (
 def test_servos_with_a_filter_are_read_and_named(servo, tmp_path):
     """They begin where the log does, not at 0; what is not corrected of them is said."""
     path, q = tmp_path / "filtered.xml", np.array([0.4, -0.3, 0.5])
-    path.write_text(with_motors(three_joints()).decode().replace("<motor ", servo))
+    path.write_text(build_motor_model_xml(three_joints()).decode().replace("<motor ", servo))
     chain, time = open_model(path, 3).chain, np.arange(0.0, 4.0, 0.01)
     chain.model.opt.gravity[:] = 0.0
     still = np.broadcast_to(q, (len(time), 3))
     log = run_of("still", time, still, 0.0 * still)
-    assert_allclose(follow_commands(chain, log, still, str(path)), still, atol=1e-9)
+    assert_allclose(simulate_commands(chain, log, still, str(path)), still, atol=1e-9)
     shake = np.sin(np.outer(time, [2.0, 3.0, 5.0]))
     log = replace(run_of("run", time, shake, 5.0 * shake), command=shake)
-    silent = replace(log, torque=0.0 * shake, unit=NOTHING)
+    silent = replace(log, torque=0.0 * shake, unit=NO_TORQUE_UNIT)
     with pytest.raises(
         mc.OptionError, match=r"servos of joint1, joint2, joint3 filter their commands"
     ):
@@ -331,10 +339,13 @@ def test_servos_with_a_filter_are_read_and_named(servo, tmp_path):
 def test_no_link_grows_in_place_of_a_rotor(tmp_path):
     """Torques tell J1's rotor from no mass off its axis: what is nearer to the drawing counts."""
     rotors = replace(LACKS, armature=np.array([6.0, 5.0, 2.0]))
-    arm, out = DrivenArm(three_joints(), with_motors(three_joints()), rotors, 3, STEP), "new.xml"
-    mc.motion_gap(save_model(arm, tmp_path), logged(arm, 3, 8.0), driven=False,
+    arm, out = (
+        DrivenArm(three_joints(), build_motor_model_xml(three_joints()), rotors, 3, STEP),
+        "new.xml",
+    )
+    mc.motion_gap(write_model_file(arm, tmp_path), simulate_logs(arm, 3, 8.0), driven=False,
                   write=tmp_path / out)  # fmt: skip
-    found, real = mujoco.MjModel.from_xml_path(str(tmp_path / out)), arm.real()
+    found, real = mujoco.MjModel.from_xml_path(str(tmp_path / out)), arm.compile_real_arm()
     assert_allclose(found.dof_armature, real.dof_armature, rtol=0.02)
     assert_allclose(found.body_mass[1:], real.body_mass[1:], rtol=0.1)
 
@@ -359,13 +370,13 @@ def test_options_of_logs_are_none_of_poses(made, tmp_path,
 
 
 def test_a_pseudo_inertia_holds_what_its_parameters_do():
-    parameters = link_parameters(2.0, np.array([0.1, -0.2, 0.3]),
+    parameters = compute_link_inertial_parameters(2.0, np.array([0.1, -0.2, 0.3]),
                                  np.array([0.5, 0.01, 0.02, 0.6, -0.03, 0.4]))  # fmt: skip
-    pseudo = bodies.pseudo_inertia(parameters)
-    assert_allclose(bodies.parameters_of(pseudo), parameters, atol=1e-15)
-    assert_allclose(bodies.physical(pseudo), pseudo, atol=1e-15)
-    values = bodies.inertial(pseudo)
-    again = bodies.of_body(2.0, values["pos"], about_of(values))
+    pseudo = bodies.pseudo_inertia_from_parameters(parameters)
+    assert_allclose(bodies.parameters_from_pseudo_inertia(pseudo), parameters, atol=1e-15)
+    assert_allclose(bodies.nearest_physical_body(pseudo), pseudo, atol=1e-15)
+    values = bodies.inertial_attributes(pseudo)
+    again = bodies.pseudo_inertia_from_inertia(2.0, values["pos"], about_of(values))
     assert_allclose(again, pseudo, atol=1e-14)
 
 
@@ -378,8 +389,10 @@ def about_of(values: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def test_a_body_as_thin_as_a_plate_is_one_that_mujoco_takes():
-    plate = bodies.of_body(2.0, np.zeros(3), np.diag([0.1, 0.2, 0.3]))  # no height at all
-    values = bodies.inertial(plate)
+    plate = bodies.pseudo_inertia_from_inertia(
+        2.0, np.zeros(3), np.diag([0.1, 0.2, 0.3])
+    )  # no height at all
+    values = bodies.inertial_attributes(plate)
     low, middle, high = np.sort(values["diaginertia"])
     assert low + middle > high
     assert_allclose(np.sort(values["diaginertia"]), [0.1, 0.2, 0.3], rtol=1e-5)
@@ -390,20 +403,22 @@ def test_slopes_are_the_derivatives_of_the_links():
     factor = rng.normal(size=(2, 4, 4))
     drawn = factor @ np.swapaxes(factor, 1, 2)
     turn = np.array([np.eye(4), np.diag([1.0, -1.0, -1.0, 1.0])])
-    arm = bodies.Bodies(drawn, np.zeros((2, 4, 4)), turn)
+    arm = bodies.ModelBodies(drawn, np.zeros((2, 4, 4)), turn)
     at = 0.3 * rng.normal(size=(2, 10))
-    slopes = arm.slopes(at)
+    slopes = arm.link_parameter_jacobian(at)
     for k in range(10):
         step = np.zeros((2, 10))
         step[:, k] = 1e-6
-        there, back = (arm.links(arm.at(at + side * step)) for side in (1.0, -1.0))
+        there, back = (
+            arm.link_parameters(arm.at_coordinates(at + side * step)) for side in (1.0, -1.0)
+        )
         assert_allclose(slopes[:, k], (there - back) / 2e-6, rtol=1e-6, atol=1e-7)
-    assert np.linalg.eigvalsh(arm.at(at)).min() > 0.0
+    assert np.linalg.eigvalsh(arm.at_coordinates(at)).min() > 0.0
 
 
 def test_a_bounded_fit_stops_at_its_bound():
     matrix = np.array([[1.0, 0.5], [0.5, 1.0], [0.1, 0.1]])
-    found = least_within(
+    found = minimise_squares_with_bounds(
         lambda x: matrix @ x - [1.0, -1.0, 0.0], lambda x: matrix, np.ones(2), np.zeros(2)
     )
     assert_allclose(found, [0.5 / 1.26, 0.0], atol=1e-6)
@@ -412,7 +427,7 @@ def test_a_bounded_fit_stops_at_its_bound():
 def test_damping_that_levels_off_falls_nowhere():
     v = np.linspace(0.0, 5.0, 200)
     for speed in (0.5, 2.0):
-        assert (np.diff(speeds(v) @ levelling(speed)) >= -1e-12).all()
+        assert (np.diff(speed_powers(v) @ levelling_damping_coefficients(speed)) >= -1e-12).all()
 
 
 def test_the_damper_of_a_servo_is_no_friction(tmp_path):

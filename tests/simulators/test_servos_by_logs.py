@@ -11,9 +11,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.dynamics.drives import Drive
-from minimax_cal.dynamics.laws import WORDS
-from minimax_cal.dynamics.logs.table import NOTHING, TORQUE, Run
+from minimax_cal.dynamics.drives import PositionDrive
+from minimax_cal.dynamics.laws import TORQUE_EFFECT_WORDS
+from minimax_cal.dynamics.logs.log_table import NO_TORQUE_UNIT, TORQUE_UNIT, Run
 from tests.conftest import run
 from tests.dynamics.motions import three_joints
 
@@ -21,17 +21,17 @@ mujoco = pytest.importorskip("mujoco", reason="needs mujoco: pip install minimax
 
 from experiments.driven_arms import (  # noqa: E402
     DrivenArm,
-    Withheld,
-    commands,
-    served,
-    with_motors,
+    WithheldEffects,
+    build_motor_model_xml,
+    draw_commanded_motion,
+    replace_motors_by_servos,
 )
 from minimax_cal.simulators.mjcf_tree import MjcfTree  # noqa: E402
 from minimax_cal.simulators.motion.drives import (  # noqa: E402
-    Served,
-    own_drives,
+    FittedDrives,
+    read_model_drives,
 )
-from minimax_cal.simulators.motion.numbers import new_model, open_model  # noqa: E402
+from minimax_cal.simulators.motion.model_parameters import new_model, open_model  # noqa: E402
 from minimax_cal.simulators.result import MotionGap  # noqa: E402
 
 pytestmark = pytest.mark.skipif(
@@ -40,13 +40,14 @@ pytestmark = pytest.mark.skipif(
 STEP, SECONDS = 0.001, 8.0
 KP, KV = np.array([2000.0, 2500.0, 600.0]), np.array([200.0, 250.0, 60.0])
 REAL_KP, REAL_KV, LATE = KP * [0.6, 1.6, 1.3], KV * [1.4, 0.8, 1.7], 0.0115
-LACKS = Withheld(np.array([4.0, 3.0, 1.5]), np.array([3.0, 4.0, 1.0]), np.array([0.4, 0.5, 0.3]),
-                 np.zeros(3))  # fmt: skip
+LACKS = WithheldEffects(
+    np.array([4.0, 3.0, 1.5]), np.array([3.0, 4.0, 1.0]), np.array([0.4, 0.5, 0.3]), np.zeros(3)
+)
 
 
 def driven(arm: DrivenArm, model: object, number: int, speed: float, late: float) -> Run:
     """A log of the arm, whose controller takes its commands late."""
-    at, data = commands(arm, number, speed), mujoco.MjData(model)
+    at, data = draw_commanded_motion(arm, number, speed), mujoco.MjData(model)
     time = STEP * np.arange(round((SECONDS + 1.0) / STEP))
     wanted, told = at(time - late)[0], at(time)[0]
     data.qpos[:3] = wanted[0]
@@ -57,14 +58,14 @@ def driven(arm: DrivenArm, model: object, number: int, speed: float, late: float
         mujoco.mj_step(model, data)
         rows.append([q, qd, data.qfrc_actuator[:3].copy(), told[k]])
     q, qd, torque, command = np.moveaxis(np.array(rows)[1000::4], 1, 0)
-    return Run(f"run{number}", "log.csv", time[1000::4] - 1.0, q, qd, None, torque, TORQUE,
+    return Run(f"run{number}", "log.csv", time[1000::4] - 1.0, q, qd, None, torque, TORQUE_UNIT,
                command=command)  # fmt: skip
 
 
 def arm_with(kp: np.ndarray, kv: np.ndarray, limit: float = np.inf) -> tuple[DrivenArm, object]:
     """An arm as its file is, and what it is really."""
-    arm = DrivenArm(three_joints(), with_motors(three_joints()), LACKS, 3, STEP)
-    real = replace(arm, xml=served(arm.xml, kp, kv)).real()
+    arm = DrivenArm(three_joints(), build_motor_model_xml(three_joints()), LACKS, 3, STEP)
+    real = replace(arm, xml=replace_motors_by_servos(arm.xml, kp, kv)).compile_real_arm()
     if np.isfinite(limit):
         real.actuator_forcelimited[:], real.actuator_forcerange[:] = 1, [-limit, limit]
     return arm, real
@@ -76,7 +77,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     folder = tmp_path_factory.mktemp("drives")
     arm, real = arm_with(REAL_KP, REAL_KV)
     path, out = folder / "arm.xml", folder / "corrected.xml"
-    path.write_bytes(served(arm.xml, KP, KV))
+    path.write_bytes(replace_motors_by_servos(arm.xml, KP, KV))
     runs = [driven(arm, real, k, speed, LATE) for k, speed in enumerate((0.4, 1.2, 0.8))]
     gap = mc.motion_gap(path, runs, write=out)
     return SimpleNamespace(arm=arm, real=real, path=path, out=out, runs=runs, gap=gap)
@@ -120,7 +121,7 @@ def test_the_fastest_run_judges_and_every_effect_has_its_worth(made):
     assert names == {(kind, f"J{j}") for kind in ("servo_gain", "command_delay") for j in (1, 2, 3)}
     for one in gap.effects:
         assert max(before / after for before, after in one.worth.values()) > 1.5
-    steps = [f"+ {WORDS[kind]}" for kind in ("servo_gain", "command_delay")]
+    steps = [f"+ {TORQUE_EFFECT_WORDS[kind]}" for kind in ("servo_gain", "command_delay")]
     assert [rung.name for rung in gap.rungs][:3] == ["as given", *steps]
     assert MotionGap.from_dict(json.loads(json.dumps(gap.to_dict()))).to_dict() == gap.to_dict()
     assert any("delay" in text and "MJX" in text for text in gap.notices)
@@ -137,11 +138,13 @@ def test_sound_drives_are_not_accused(made, tmp_path):
 
 
 def test_what_nothing_improves_is_not_written(tmp_path):
-    nothing = Withheld(*np.zeros((4, 3)))
+    nothing = WithheldEffects(*np.zeros((4, 3)))
     arm, _ = arm_with(KP, KV)
-    real = replace(arm, withheld=nothing, xml=served(arm.xml, KP, KV)).real()
+    real = replace(
+        arm, withheld=nothing, xml=replace_motors_by_servos(arm.xml, KP, KV)
+    ).compile_real_arm()
     path, out, files = tmp_path / "arm.xml", tmp_path / "out.xml", []
-    path.write_bytes(served(arm.xml, KP, KV))
+    path.write_bytes(replace_motors_by_servos(arm.xml, KP, KV))
     for k, speed in enumerate((0.4, 1.2)):
         one = driven(arm, real, k, speed, 0.0)
         files.append(tmp_path / f"log{k}.csv")
@@ -171,17 +174,17 @@ def test_a_torque_limit_is_found_and_written(made, tmp_path):
 def test_every_number_of_a_drive_is_read_back_from_the_file(made):
     opened = open_model(made.path, 3)
     assert opened.has_correctable_servos()
-    given = own_drives(opened.chain)
+    given = read_model_drives(opened.chain)
     assert_allclose([drive.stiffness for drive in given], KP)
-    wanted = (Drive(900.0, 80.0, 0.25, 0.013, 55.0), given[1], Drive(700.0, 50.0))
+    wanted = (PositionDrive(900.0, 80.0, 0.25, 0.013, 55.0), given[1], PositionDrive(700.0, 50.0))
     fits = tuple(SimpleNamespace(drive=drive) for drive in wanted)
     told = tuple((kind, j) for kind in ("servo_gain", "command_delay", "torque_limit")
                  for j in range(3))  # fmt: skip
-    new = Served(given, fits, told, (0.0, 0.0), np.zeros(3)).apply_to(opened)
-    for drive, again in zip(wanted, own_drives(new.chain), strict=True):
+    new = FittedDrives(given, fits, told, (0.0, 0.0), np.zeros(3)).apply_to(opened)
+    for drive, again in zip(wanted, read_model_drives(new.chain), strict=True):
         assert_allclose(list(vars(again).values()), list(vars(drive).values()), rtol=1e-12)
-    back = Served(given, (), (), (0.0, 0.0), np.zeros(3)).apply_to(new)
-    assert own_drives(back.chain) == given
+    back = FittedDrives(given, (), (), (0.0, 0.0), np.zeros(3)).apply_to(new)
+    assert read_model_drives(back.chain) == given
 
 
 def test_actuators_and_ranges_say_what_was_written(made, tmp_path):
@@ -290,7 +293,7 @@ def test_masses_set_the_one_scale_that_positions_do_not_tell(made, tmp_path):
     root.remove(root.find("custom"))  # the robot whole, which would count in place of the bodies
     heavy = tmp_path / "heavy.xml"
     heavy.write_bytes(ElementTree.tostring(root))
-    bare = [replace(one, torque=0.0 * one.torque, unit=NOTHING) for one in made.runs]
+    bare = [replace(one, torque=0.0 * one.torque, unit=NO_TORQUE_UNIT) for one in made.runs]
     gaps, models = [], []
     for path, out in ((made.path, tmp_path / "a.xml"), (heavy, tmp_path / "b.xml")):
         gaps.append(mc.motion_gap(path, bare, write=out))
@@ -318,15 +321,15 @@ def test_drives_that_carry_no_gravity_are_told_from_a_model_whose_drives_do(made
 
 
 def test_a_damper_too_large_for_an_explicit_step_changes_the_integrator(made):
-    root = ElementTree.fromstring(served(made.arm.xml, KP, 0.02 * KV))
+    root = ElementTree.fromstring(replace_motors_by_servos(made.arm.xml, KP, 0.02 * KV))
     root.find("option").set("integrator", "Euler")
     path = made.path.with_name("euler.xml")
     path.write_bytes(ElementTree.tostring(root))
     opened = open_model(path, 3)
-    given = own_drives(opened.chain)
+    given = read_model_drives(opened.chain)
     for damper, integrator in ((0.03 * KV[0], "mjINT_EULER"), (9.0 * KV[0], "mjINT_IMPLICITFAST")):
         fits = (SimpleNamespace(drive=replace(given[0], damper=damper)), None, None)
-        new = Served(given, fits, (("servo_gain", 0),), (0.0, 0.0),
+        new = FittedDrives(given, fits, (("servo_gain", 0),), (0.0, 0.0),
                      np.zeros(3)).apply_to(opened)  # fmt: skip
         model = new.chain.model
         assert mujoco.mjtIntegrator(model.opt.integrator).name == integrator

@@ -1,5 +1,7 @@
 """USD that mujoco-usd-converter makes of a written model: the page's table of what arrives."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -10,25 +12,26 @@ usd = pytest.importorskip("mujoco_usd_converter", reason="needs mujoco-usd-conve
 
 from pxr import Gf, Usd, UsdPhysics  # noqa: E402
 
-from minimax_cal.simulators.motion.numbers import (  # noqa: E402
-    Bodies,
-    given_numbers,
-    has_powers,
+from minimax_cal.simulators.motion.model_parameters import (  # noqa: E402
+    ModelBodies,
+    has_damping_polynomials,
     open_model,
-    write_numbers,
+    read_model_parameters,
+    write_model_parameters,
 )
 
 
 def test_what_usd_holds_of_a_written_model(tmp_path):
     opened, rng = open_model("ur10", 6), np.random.default_rng(0)
     chain, model = opened.chain, opened.chain.model
-    given, damping = given_numbers(chain, Bodies.of(chain)), np.zeros((6, 3))
-    damping[:, : 3 if has_powers(model) else 1] = rng.uniform(1.0, 5.0, (6, 1))
+    given, damping = read_model_parameters(chain, ModelBodies.read(chain)), np.zeros((6, 3))
+    damping[:, : 3 if has_damping_polynomials(model) else 1] = rng.uniform(1.0, 5.0, (6, 1))
     document = opened.given.document
-    write_numbers(document, chain, given, given.put(
-        bodies=1.3 * given.bodies, armature=rng.uniform(0.1, 1.0, 6),
+    write_model_parameters(document, chain, given, replace(
+        given, bodies=1.3 * given.bodies, armature=rng.uniform(0.1, 1.0, 6),
         friction=rng.uniform(1.0, 9.0, 6), damping=damping,
-        stiffness=np.array([[7.0, 0.0, 0.5]] * 6), rest=rng.uniform(0.1, 0.3, 6), late=-0.004,
+        stiffness=np.array([[7.0, 0.0, 0.5]] * 6), spring_rest=rng.uniform(0.1, 0.3, 6),
+        delay=-0.004,
     ))  # fmt: skip
     path = tmp_path / "arm.xml"
     opened.write(path)

@@ -10,24 +10,27 @@ from numpy.testing import assert_allclose, assert_array_equal
 from problems_fit import solve
 from scipy import optimize
 
-from experiments.speed import identified
-from minimax_cal.ground.arrays import Array
-from minimax_cal.modelling import start
-from minimax_cal.modelling.model import SumOfSquares, model_of
-from minimax_cal.modelling.parameters import State
+from experiments.speed import identify_parameters
+from minimax_cal.core.arrays import Array
+from minimax_cal.modelling import global_start
+from minimax_cal.modelling.parameters import ParameterValues
+from minimax_cal.modelling.point_model import PointLeastSquares, build_point_model
 from minimax_cal.modelling.simulate import Truth, simulate
-from minimax_cal.robots.kinematics import rotation
+from minimax_cal.robots.kinematics import rotation_from_vector
 from minimax_cal.solvers import least_squares
-from minimax_cal.solvers.bounded import bounded, nearest
+from minimax_cal.solvers.bounded_least_squares import (
+    solve_bounded_least_squares,
+    solve_bounded_normal_equations,
+)
 from minimax_cal.solvers.least_squares import (
-    METHODS,
-    Limits,
-    Method,
-    compared,
-    examine,
-    nielsen,
-    solve_normal,
-    tried,
+    LEAST_SQUARES_METHODS,
+    LeastSquaresLimits,
+    LeastSquaresMethod,
+    compare_trial_costs,
+    linearise_iterates,
+    solve_normal_equations,
+    take_trial_step,
+    update_damping_by_nielsen,
 )
 from minimax_cal.solvers.least_squares import (
     solve as least,
@@ -37,9 +40,9 @@ from minimax_cal.solvers.status import Status
 # ---- least squares -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", LEAST_SQUARES_METHODS)
 def test_every_method_reaches_the_same_minimum(method, robot, noisy):
-    model, begin = identified(robot, noisy.data)
+    model, begin = identify_parameters(robot, noisy.data)
     found = solve(model, begin, method)
     best = solve(model, begin)
     assert found.status[0] is Status.CONVERGED
@@ -49,29 +52,29 @@ def test_every_method_reaches_the_same_minimum(method, robot, noisy):
 
 
 def test_minimum_is_scipys(robot, noisy):
-    model, begin = identified(robot, noisy.data)
+    model, begin = identify_parameters(robot, noisy.data)
     best = solve(model, begin)
 
     def residual(dx: np.ndarray) -> np.ndarray:
-        step = np.zeros(model.names.count)
+        step = np.zeros(model.names.parameter_count)
         step[model.active] = dx * 1e-3
-        return 1e3 * model.error(begin.step(step)).reshape(-1)
+        return 1e3 * model.point_errors(begin.step(step)).reshape(-1)
 
     peer = optimize.least_squares(residual, np.zeros(model.active.sum()), xtol=1e-14, ftol=1e-14)
     assert_allclose(best.cost[0] * 1e6, 2 * peer.cost, rtol=1e-9)
 
 
 def test_many_starts_at_once_equal_each_alone(robot, noisy):
-    model, begin = identified(robot, noisy.data)
+    model, begin = identify_parameters(robot, noisy.data)
     rng = np.random.default_rng(3)
     starts = begin.repeat(5)
-    dx = np.zeros((5, model.names.count))
-    dx[:, model.active & ~model.names.linear] = 0.1 * rng.normal(size=(5, 13))
+    dx = np.zeros((5, model.names.parameter_count))
+    dx[:, model.active & ~model.names.linear_mask] = 0.1 * rng.normal(size=(5, 13))
     starts = starts.step(dx)
-    points = float(model.counts.sum())
-    together = least_squares.solve(SumOfSquares(model), starts, 5, points)
+    points = float(model.pose_counts_by_target.sum())
+    together = least_squares.solve(PointLeastSquares(model), starts, 5, points)
     for i in range(5):
-        alone = least_squares.solve(SumOfSquares(model), starts.take(np.array([i])), 1, points)
+        alone = least_squares.solve(PointLeastSquares(model), starts.take(np.array([i])), 1, points)
         assert_allclose(together.cost[i], alone.cost[0], rtol=1e-10)
         # the way is the same until the cost has converged; the last steps are about rounding
         way = alone.trace[:, 0]
@@ -83,24 +86,26 @@ def test_closed_form_start_is_the_best_frame(robot, rng):
     """Base and targets of the nominal robot, against a local search from the truth."""
     for seed in range(5):
         made = simulate(robot, 30, 2, seed)
-        model = model_of(robot, made.data)
-        frame = start.fit_base(model, robot.mdh)
-        chosen = ~model.names.links
+        model = build_point_model(robot, made.data)
+        frame = global_start.fit_base_and_targets(model, robot.mdh)
+        chosen = ~model.names.link_mask
         cell = made.cell
-        near = State(robot.mdh, cell.base[:3, :3], cell.base[:3, 3], cell.target_positions)
-        local = solve(model.only(chosen), near)
-        points = model.counts.sum()
+        near = ParameterValues(
+            robot.mdh, cell.base[:3, :3], cell.base[:3, 3], cell.target_positions
+        )
+        local = solve(model.with_active(chosen), near)
+        points = model.pose_counts_by_target.sum()
         assert_allclose(frame.mean_square * points, local.cost[0], rtol=1e-9)
-        assert_allclose(model.cost(frame.state).sum(), local.cost[0], rtol=1e-9)
+        assert_allclose(model.target_costs(frame.state).sum(), local.cost[0], rtol=1e-9)
 
 
 def test_100_random_bases_reach_the_global_minimum(robot):
     for seed in range(100):
         truth = Truth(noise=0, noise_per_metre=0, compliance=0)
         made = simulate(robot, 25, 1 + 2 * (seed % 2), seed, truth)
-        model, begin = identified(robot, made.data)
+        model, begin = identify_parameters(robot, made.data)
         found = solve(model, begin)
-        miss = np.sqrt(found.cost[0] / model.counts.sum())
+        miss = np.sqrt(found.cost[0] / model.pose_counts_by_target.sum())
         assert miss < 1e-10, f"seed {seed}: {miss} m"
 
 
@@ -112,19 +117,21 @@ def test_search_finds_gross_angle_errors(robot):
         wrong = robot.mdh.copy()
         wrong[1, 2] += rng.uniform(-3.1, 3.1)
         wrong[2, 3] += rng.uniform(-3.1, 3.1)
-        model, _ = identified(robot, made.data)
-        found = start.search(model, wrong, float(model.counts.sum()))
-        assert np.sqrt(found.cost[0] / model.counts.sum()) < 1e-9, f"seed {seed}"
+        model, _ = identify_parameters(robot, made.data)
+        found = global_start.search_base_rotations(
+            model, wrong, float(model.pose_counts_by_target.sum())
+        )
+        assert np.sqrt(found.cost[0] / model.pose_counts_by_target.sum()) < 1e-9, f"seed {seed}"
 
 
 def test_rotation_steps_have_no_gimbal(robot, clean):
     """A base pitched by 90 degrees, where Euler angles are singular."""
     cell = clean.cell
-    pitch = rotation(np.array([0.0, np.pi / 2, 0.0]))
+    pitch = rotation_from_vector(np.array([0.0, np.pi / 2, 0.0]))
     data = clean.data.with_y((clean.data.y - cell.base[:3, 3]) @ cell.base[:3, :3] @ pitch.T)
-    model, begin = identified(robot, data)
+    model, begin = identify_parameters(robot, data)
     found = solve(model, begin)
-    assert np.sqrt(found.cost[0] / model.counts.sum()) < 1e-12
+    assert np.sqrt(found.cost[0] / model.pose_counts_by_target.sum()) < 1e-12
 
 
 # ---- gauss newton steps --------------------------------------------------------------------------
@@ -199,7 +206,7 @@ def projected(w: Array) -> Array:
     return np.asarray(Y - basis @ np.linalg.lstsq(basis, Y, rcond=None)[0])
 
 
-def expected(v: Array, method: Method, damping: float) -> tuple[Array, Array, Array]:
+def expected(v: Array, method: LeastSquaresMethod, damping: float) -> tuple[Array, Array, Array]:
     """Residual, Jacobian and step of the problem that a method solves, from one iterate."""
     if not method.separable:
         e, J = residual(v), jacobian(v)
@@ -225,21 +232,27 @@ def expected(v: Array, method: Method, damping: float) -> tuple[Array, Array, Ar
 def test_the_methods_are_those_of_the_paper():
     """Two switches, and Kaufman's form of the two that eliminate the lengths."""
     assert {
-        name: (m.separable, m.damped, m.full) for name, m in METHODS.items() if m.separable
+        name: (m.separable, m.damped, m.full)
+        for name, m in LEAST_SQUARES_METHODS.items()
+        if m.separable
     } == {
         "snlgn": (True, False, True),
         "snllm": (True, True, True),
         "snlgn-kaufman": (True, False, False),
         "snllm-kaufman": (True, True, False),
     }
-    assert (METHODS["nlgn"].damped, METHODS["nllm"].damped, len(METHODS)) == (False, True, 6)
+    assert (
+        LEAST_SQUARES_METHODS["nlgn"].damped,
+        LEAST_SQUARES_METHODS["nllm"].damped,
+        len(LEAST_SQUARES_METHODS),
+    ) == (False, True, 6)
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", LEAST_SQUARES_METHODS)
 def test_a_step_is_that_of_dense_algebra(name):
-    method, problem = METHODS[name], Decay(LINEAR)
-    at = examine(problem, Points(BEGIN), method)
-    trial, motion, gain = tried(problem, at, DAMPING * method.damped, 25.0, method)
+    method, problem = LEAST_SQUARES_METHODS[name], Decay(LINEAR)
+    at = linearise_iterates(problem, Points(BEGIN), method)
+    trial, motion, gain = take_trial_step(problem, at, DAMPING * method.damped, 25.0, method)
     for i, begin in enumerate(BEGIN):
         e, J, step = expected(begin, method, DAMPING[i])
         moved = at.x.value[i].copy()
@@ -254,10 +267,12 @@ def test_a_step_is_that_of_dense_algebra(name):
         assert_allclose(trial.cost[i], (residual(trial.x.value[i]) ** 2).sum(), rtol=1e-12)
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", LEAST_SQUARES_METHODS)
 def test_all_end_at_the_least_cost_and_say_when(name):
     told: list[int] = []
-    found = least(Decay(LINEAR), Points(BEGIN[:2]), 2, 25.0, METHODS[name], progress=told.append)
+    found = least(
+        Decay(LINEAR), Points(BEGIN[:2]), 2, 25.0, LEAST_SQUARES_METHODS[name], progress=told.append
+    )
     assert found.status == (Status.CONVERGED,) * 2
     slope = [jacobian(v).T @ residual(v) for v in found.x.value]
     assert np.abs(slope).max() < 1e-10
@@ -267,23 +282,25 @@ def test_all_end_at_the_least_cost_and_say_when(name):
     assert len(found.trace) == len(told) + 1
     for i, last in enumerate(found.iterations):
         assert_array_equal(found.trace[last:, i], found.cost[i])
-        alone = least(Decay(LINEAR), Points(BEGIN[i : i + 1]), 1, 25.0, METHODS[name])
+        alone = least(Decay(LINEAR), Points(BEGIN[i : i + 1]), 1, 25.0, LEAST_SQUARES_METHODS[name])
         assert abs(alone.iterations[0] - last) <= 1
-    short = least(Decay(LINEAR), Points(BEGIN[:2]), 2, 25.0, METHODS[name], trace=False)
+    short = least(
+        Decay(LINEAR), Points(BEGIN[:2]), 2, 25.0, LEAST_SQUARES_METHODS[name], keep_trace=False
+    )
     assert_array_equal(short.trace, found.trace[[0, -1]])
 
 
 def test_an_undamped_search_that_leaves_the_numbers_failed():
     far = BEGIN[:1] * [1.0, -500.0, 1.0, 1.0]  # exp(+350 t) overflows
-    found = least(Decay(LINEAR), Points(far), 1, 25.0, METHODS["nlgn"])
+    found = least(Decay(LINEAR), Points(far), 1, 25.0, LEAST_SQUARES_METHODS["nlgn"])
     assert found.status == (Status.FAILED,)
     assert_array_equal(found.x.value, far)
 
 
 def test_a_slope_that_lies_stalls_where_it_began():
     lie = replace(Decay(LINEAR), sense=-1.0)
-    limits = Limits(damping=1e-2)
-    found = least(lie, Points(BEGIN[:1]), 1, 25.0, METHODS["nllm"], limits)
+    limits = LeastSquaresLimits(damping=1e-2)
+    found = least(lie, Points(BEGIN[:1]), 1, 25.0, LEAST_SQUARES_METHODS["nllm"], limits)
     assert found.status == (Status.STALLED,)
     assert_array_equal(found.x.value, BEGIN[:1])
     assert_array_equal(found.trace, found.trace[:1] * np.ones_like(found.trace))
@@ -293,8 +310,8 @@ def test_a_slope_that_lies_stalls_where_it_began():
 
 @pytest.mark.parametrize("most", [0, 3])
 def test_a_limit_is_the_number_of_steps(most):
-    limits = Limits(iterations=most)
-    found = least(Decay(LINEAR), Points(BEGIN[:1]), 1, 25.0, METHODS["nllm"], limits)
+    limits = LeastSquaresLimits(iterations=most)
+    found = least(Decay(LINEAR), Points(BEGIN[:1]), 1, 25.0, LEAST_SQUARES_METHODS["nllm"], limits)
     assert found.status == (Status.ITERATION_LIMIT,)
     assert (found.iterations[0], len(found.trace)) == (most, most + 1)
     assert np.array_equal(found.x.value, BEGIN[:1]) == (most == 0)
@@ -305,7 +322,7 @@ def test_what_is_singular_to_rounding_has_the_least_solution():
     near = np.array([[1.0, 1.0 - 2e-15], [1.0 - 2e-15, 1.0]])
     for scale in (np.ones(2), np.array([1e-6, 1e6])):
         matrix, right = near * np.outer(scale, scale), scale * [2.0, 2.0 - 2e-9]
-        found = solve_normal(matrix, right[:, None])[:, 0]
+        found = solve_normal_equations(matrix, right[:, None])[:, 0]
         assert_allclose(found * scale, 1.0, rtol=0, atol=1e-8)
 
 
@@ -313,16 +330,18 @@ def test_damping_goes_by_nielsens_rule():
     damping, growth = np.full(5, 8.0), np.array([2.0, 2.0, 2.0, 4.0, 16.0])
     accept = np.array([True, True, True, False, True])
     ratio = np.array([0.5, 1.0, 0.25, 0.0, 0.75])
-    after, next_growth = nielsen(damping, growth, accept, ratio)
+    after, next_growth = update_damping_by_nielsen(damping, growth, accept, ratio)
     assert_allclose(after, [8.0, 8.0 / 3.0, 9.0, 32.0, 7.0], rtol=1e-15)
     assert_array_equal(next_growth, [2.0, 2.0, 2.0, 8.0, 2.0])
 
 
 def test_a_trial_is_compared_with_what_was_predicted():
-    at = examine(Decay(LINEAR), Points(np.repeat(BEGIN[:1], 5, axis=0)), METHODS["nlgn"])
+    at = linearise_iterates(
+        Decay(LINEAR), Points(np.repeat(BEGIN[:1], 5, axis=0)), LEAST_SQUARES_METHODS["nlgn"]
+    )
     at = replace(at, cost=np.full(5, 10.0))
     trial = replace(at, cost=np.array([9.0, 11.0, 6.0, 10.0 + 1e-12, np.nan]))
-    lower, ratio = compared(at, trial, np.array([2.0, 2.0, 2.0, 1e-13, 2.0]))
+    lower, ratio = compare_trial_costs(at, trial, np.array([2.0, 2.0, 2.0, 1e-13, 2.0]))
     assert_array_equal(lower, [True, False, True, True, False])
     assert_allclose(ratio, [0.5, 0.0, 1.0, 1.0, 1.0], rtol=1e-15)
 
@@ -338,8 +357,8 @@ def test_a_bounded_step_is_the_optimum(rng):
     x = cp.Variable(9)
     cost = cp.quad_form(x, cp.psd_wrap(gram)) - 2.0 * pull @ x
     cp.Problem(cp.Minimize(cost), [x[:4] >= -0.05, x[2:6] <= 0.02]).solve(solver=cp.CLARABEL)
-    assert_allclose(bounded(gram, pull, low, high), x.value, atol=1e-6)
-    free = bounded(gram, pull, np.full(9, -np.inf), np.full(9, np.inf))
+    assert_allclose(solve_bounded_normal_equations(gram, pull, low, high), x.value, atol=1e-6)
+    free = solve_bounded_normal_equations(gram, pull, np.full(9, -np.inf), np.full(9, np.inf))
     assert_allclose(free, np.linalg.solve(gram, pull), rtol=1e-6)
 
 
@@ -348,7 +367,7 @@ def test_columns_that_are_the_same_share_their_part(rng):
     matrix = rng.normal(size=(12, 3))[:, [0, 1, 2, 0, 1]]
     right = 3.0 * rng.normal(size=12)
     low, high = np.array([-np.inf, -np.inf, 0.0, 0.0, 0.0]), np.full(5, np.inf)
-    x = bounded(matrix.T @ matrix, matrix.T @ right, low, high)
+    x = solve_bounded_normal_equations(matrix.T @ matrix, matrix.T @ right, low, high)
     y = cp.Variable(5)
     best = cp.Problem(cp.Minimize(cp.sum_squares(matrix @ y - right)), [y[2:] >= 0.0])
     best.solve(solver=cp.CLARABEL)
@@ -359,22 +378,22 @@ def test_columns_that_are_the_same_share_their_part(rng):
 def test_a_compiled_solver_that_gives_up_is_replaced(rng, monkeypatch):
     matrix, target = rng.normal(size=(5, 5)), rng.normal(size=5)
     low, high = np.full(5, -0.1), np.full(5, np.inf)
-    fast = nearest(matrix, target, low, high)
+    fast = solve_bounded_least_squares(matrix, target, low, high)
 
     def stopped(*given: object, **more: object) -> None:
         raise RuntimeError("Maximum number of iterations reached.")
 
     monkeypatch.setattr(scipy.optimize, "nnls", stopped)
-    assert_allclose(nearest(matrix, target, low, high), fast, rtol=0, atol=1e-9)
+    assert_allclose(solve_bounded_least_squares(matrix, target, low, high), fast, rtol=0, atol=1e-9)
 
 
 def test_lengths_follow_a_step_to_first_order():
-    from minimax_cal.solvers.least_squares import lift
+    from minimax_cal.solvers.least_squares import extend_step_to_all_parameters
 
-    method, problem = METHODS["snlgn"], Decay(LINEAR)
-    at = examine(problem, Points(BEGIN), method)
+    method, problem = LEAST_SQUARES_METHODS["snlgn"], Decay(LINEAR)
+    at = linearise_iterates(problem, Points(BEGIN), method)
     short = np.array([[1e-6, -2e-6]] * 3)
-    whole = lift(LINEAR, short, at.gradient, at.gram, method)
+    whole = extend_step_to_all_parameters(LINEAR, short, at.gradient, at.gram, method)
     assert_array_equal(whole[:, ~LINEAR], short)
     for v, step in zip(at.x.value, whole, strict=True):
         best = np.linalg.lstsq(columns(v[~LINEAR] + step[~LINEAR]), Y, rcond=None)[0]

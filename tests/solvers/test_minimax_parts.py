@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from minimax_cal.ground.arrays import Array
+from minimax_cal.core.arrays import Array
 from minimax_cal.solvers.bfgs import Bfgs
 from minimax_cal.solvers.epigraph_qp import (
     SearchStep,
-    elastic_qp,
-    epigraph_qp,
+    build_elastic_qp,
+    build_epigraph_qp,
+    does_step_lower_violation,
     find_functions_above,
     ignore_warm_start,
-    lowers_violation,
     solve_subproblem,
     update_penalties,
 )
@@ -31,7 +31,7 @@ from minimax_cal.solvers.linearisation import (
     constraint_excess,
     measure_kkt,
 )
-from minimax_cal.solvers.minimax import Sqp, merge_notes, solve
+from minimax_cal.solvers.minimax import Sqp, merge_similar_notes, solve
 from minimax_cal.solvers.status import Status
 from qp_backends import Problem, Solution
 from qp_backends import Status as QpStatus
@@ -82,7 +82,7 @@ def parabola(lower: float = -INF, upper: float = INF) -> Curve:
 
 
 def begun(problem: Curve, x: float, hessian: str = "bfgs") -> Iterate[Array]:
-    return Iterate.start(problem, np.array([x]), hessian, np.zeros(0))
+    return Iterate.start_at(problem, np.array([x]), hessian, np.zeros(0))
 
 
 def standing(here: Linearisation, mu: Array, lower: Array, upper: Array) -> Iterate[Array]:
@@ -133,13 +133,15 @@ def test_a_violation_that_no_step_lessens_is_hopeless():
     here = linear([0.0], [[1.0]], [2.0, 0.0], [[1.0], [1.0]])
     lower, upper = np.array([-INF, 1.0]), np.array([1.0, INF])
     assert_array_equal(constraint_excess(here.c, lower, upper), [1.0, 1.0])
-    assert not lowers_violation(
+    assert not does_step_lower_violation(
         here, np.array([0.7]), lower, upper, 1e-8
     )  # one gains what the other loses
-    assert lowers_violation(here, np.array([0.7]), lower, upper, 3.0)  # not violated, so large
+    assert does_step_lower_violation(
+        here, np.array([0.7]), lower, upper, 3.0
+    )  # not violated, so large
     only = replace(here, c=here.c[:1], normal=here.normal[:1])
-    assert lowers_violation(only, np.array([-0.1]), lower[:1], upper[:1], 1e-8)
-    assert not lowers_violation(only, np.array([0.1]), lower[:1], upper[:1], 1e-8)
+    assert does_step_lower_violation(only, np.array([-0.1]), lower[:1], upper[:1], 1e-8)
+    assert not does_step_lower_violation(only, np.array([0.1]), lower[:1], upper[:1], 1e-8)
 
 
 # ---- quadratic programs ------------------------------------------------------------------------
@@ -150,7 +152,7 @@ def test_a_violation_that_no_step_lessens_is_hopeless():
 )
 def test_the_epigraph_problem_is_its_formula(decrease, curvature, rng):
     hessian = np.array([[2.0, 0.5], [0.5, 1.0]])
-    made = epigraph_qp(BENT, 3.5, hessian, LOWER, UPPER, decrease)
+    made = build_epigraph_qp(BENT, 3.5, hessian, LOWER, UPPER, decrease)
     d, v = rng.normal(size=2), rng.normal()
     x = np.append(d, v)
     bent = 0.5 * d @ hessian @ d
@@ -173,7 +175,7 @@ def test_a_relaxed_constraint_is_kept_if_its_price_is_high(price, there, sign):
     rows = np.array([[0.0, -1.0], [1.0, 0.0]])
     made = Problem(np.diag([1.0, 1e-8]), np.array([0.0, 1.0]), rows, np.array([-INF, low]),
                    np.array([0.0, high]))  # fmt: skip
-    found = solve_qp(elastic_qp(made, 1, np.array([price])), name="daqp", tolerance=1e-9)
+    found = solve_qp(build_elastic_qp(made, 1, np.array([price])), name="daqp", tolerance=1e-9)
     assert_allclose(found.x[0], sign * there, rtol=1e-6)
     assert_allclose(found.x[2:].sum(), 2.0 - there, atol=1e-6)
 
@@ -226,9 +228,9 @@ def test_of_many_functions_the_largest_come_first():
     mu = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0])
     nothing = np.zeros(0)
     seven = standing(linear(values, [[1.0]] * 7), mu, nothing, nothing)
-    assert_array_equal(seven.select_largest_functions(seven.here), [1, 3, 5])
+    assert_array_equal(seven.select_largest_functions(seven.linearisation), [1, 3, 5])
     assert_array_equal(
-        replace(seven, qp_count=1).select_largest_functions(seven.here), [1, 2, 3, 5]
+        replace(seven, qp_count=1).select_largest_functions(seven.linearisation), [1, 2, 3, 5]
     )
     six = linear(values[:6], [[1.0]] * 6)
     assert_array_equal(seven.select_largest_functions(six), range(6))
@@ -258,13 +260,13 @@ def test_contradicting_constraints_are_relaxed_at_a_price():
 
 def test_it_begins_with_even_multipliers_or_those_given():
     problem = Plane(np.array([1.0, 2.0, 4.0, 0.0]))
-    at = Iterate.start(problem, np.zeros(1), "gauss-newton", np.zeros(0))
+    at = Iterate.start_at(problem, np.zeros(1), "gauss-newton", np.zeros(0))
     assert_array_equal(at.mu, 0.25)
     assert_array_equal(at.lam, [0.0])
     assert at.quasi_newton is None
     assert at.kkt.residual == at.kkt.complementarity == (4.0 - 7.0 / 4.0) / 4.0
     given = np.array([0.0, 0.5, 0.5, 0.0])
-    assert_array_equal(Iterate.start(problem, np.zeros(1), "gauss-newton", given).mu, given)
+    assert_array_equal(Iterate.start_at(problem, np.zeros(1), "gauss-newton", given).mu, given)
     assert begun(parabola(), 1.0).quasi_newton is not None
 
 
@@ -325,10 +327,10 @@ def test_the_notes_of_backends_are_told_once():
 
 def test_notes_that_differ_in_their_numbers_are_one():
     notes = [f"daqp said infeasible, its relative residual is {r}" for r in ("1.2e-08", "4", "inf")]
-    first, other = merge_notes([*notes[:2], "slow", notes[1]])
+    first, other = merge_similar_notes([*notes[:2], "slow", notes[1]])
     assert first == f"{notes[0]} (the first of 3 alike)"
     assert other == "slow"
-    assert merge_notes(notes[1:]) == tuple(notes[1:])
+    assert merge_similar_notes(notes[1:]) == tuple(notes[1:])
 
 
 def test_the_hessian_has_a_floor_and_is_damped():
@@ -404,7 +406,7 @@ def judged(at: Iterate[Array], *kkt: float) -> Iterate[Array]:
 )
 def test_patience_and_damping_have_an_end(residual, violation, state, ended, rough):
     at = judged(replace(begun(parabola(), 1.0), **state), residual, 0.0, violation)
-    end = at.status_in_place if "stalled_count" in state else at.status_after_step
+    end = at.status_before_step if "stalled_count" in state else at.status_after_step
     assert end(1e-8) is ended
     assert end(1e-8, is_exact=False) is rough
 
@@ -417,12 +419,12 @@ def test_values_that_have_all_underflowed_are_optimal():
 
 def test_damping_grows_and_falls_tenfold():
     at = begun(parabola(), 1.0)
-    assert at.damp().damping == 1e-3
-    assert replace(at, damping=2.0).damp().damping == 20.0
+    assert at.with_more_damping().damping == 1e-3
+    assert replace(at, damping=2.0).with_more_damping().damping == 20.0
     there = at.problem.linearise(np.array([0.25]))
     for before, after in ((2.0, 0.2), (2e-6, 2e-7), (1e-6, 0.0), (0.0, 0.0)):
         move = np.array([-0.75])
-        moved = replace(at, damping=before).move(move, np.array([0.25]), there)
+        moved = replace(at, damping=before).move_to(move, np.array([0.25]), there)
         assert_allclose(moved.damping, after, rtol=1e-12)
     assert_allclose(moved.displacement, -0.75)
     assert_allclose(moved.kkt.stationarity, 0.5 * 0.75 / 0.25**2)  # slope by way over value
@@ -548,7 +550,7 @@ def updated(start: Bfgs, s: list[float], q: list[float]) -> Bfgs:
     return start.update(np.array(s), *changed(q), np.ones(1), np.full(1, 2.0))
 
 
-GUESS = Bfgs(np.array([[2.0, 0.5], [0.5, 1.0]]), fresh=False)
+GUESS = Bfgs(np.array([[2.0, 0.5], [0.5, 1.0]]), is_guess=False)
 
 
 def test_the_hessian_explains_the_latest_step():
@@ -573,31 +575,31 @@ def test_curvature_that_is_missing_is_damped_by_powell(q):
 
 
 def test_the_first_guess_takes_its_size_from_the_first_step():
-    fresh = Bfgs(np.eye(2), fresh=True)
+    fresh = Bfgs(np.eye(2), is_guess=True)
     s, q = np.array([2.0, 0.0]), np.array([0.4, 0.2])
     size = (q @ q) / (q @ s)
-    sized = updated(Bfgs(size * np.eye(2), fresh=False), s.tolist(), q.tolist())
+    sized = updated(Bfgs(size * np.eye(2), is_guess=False), s.tolist(), q.tolist())
     found = updated(fresh, s.tolist(), q.tolist())
     assert_allclose(found.matrix, sized.matrix, rtol=1e-12)
-    assert not found.fresh
+    assert not found.is_guess
     back = updated(fresh, s.tolist(), (-q).tolist())  # no size in a fall of the slope
-    assert_allclose(back.matrix, updated(replace(fresh, fresh=False), [2.0, 0.0],
+    assert_allclose(back.matrix, updated(replace(fresh, is_guess=False), [2.0, 0.0],
                                          [-0.4, -0.2]).matrix)  # fmt: skip
 
 
 def test_steps_that_teach_nothing_leave_the_hessian():
     assert updated(GUESS, [0.0, 0.0], [1.0, 1.0]) is GUESS
     assert updated(GUESS, [1.0, 0.0], [np.nan, 1.0]) is GUESS
-    hollow = Bfgs(np.diag([0.0, 1.0]), fresh=False)
+    hollow = Bfgs(np.diag([0.0, 1.0]), is_guess=False)
     assert updated(hollow, [1.0, 0.0], [1.0, 1.0]) is hollow
 
 
 def test_the_hessian_begins_with_the_mean_curvature_where_there_is_one():
     here = linear([0.0, 0.0], [[1.0, 0.0], [0.0, 1.0]])
     guess = np.array([1.0, 4.0])
-    plain = Bfgs.start(here, guess)
-    assert plain.fresh
+    plain = Bfgs.from_linearisation(here, guess)
+    assert plain.is_guess
     assert_array_equal(plain.matrix, np.diag(guess))
-    known = Bfgs.start(replace(here, curvature=lambda mu: np.diag(mu) + 1.0), guess)
-    assert not known.fresh
+    known = Bfgs.from_linearisation(replace(here, curvature=lambda mu: np.diag(mu) + 1.0), guess)
+    assert not known.is_guess
     assert_allclose(known.matrix, [[1.5015, 1.0], [1.0, 1.5015]])

@@ -14,7 +14,7 @@ from minimax_cal.solvers.derivatives import (
     CountedFunction,
     complex_step_jacobian,
     difference_jacobian,
-    measure_lengths,
+    measure_variable_lengths,
 )
 from minimax_cal.solvers.max_problem import MaxOfFunctions
 from minimax_cal.solvers.status import Status
@@ -364,14 +364,14 @@ def test_the_length_of_a_variable_is_found_from_zero(unit):
         return np.array([np.exp(a), 1.0 + 4.0 * b**2, 0.1 * c - 1.0, d**4])
 
     with np.errstate(over="ignore"):
-        found = measure_lengths(fun, np.zeros(5), -np.inf, np.inf, 1.0, np.ones(5))
+        found = measure_variable_lengths(fun, np.zeros(5), -np.inf, np.inf, 1.0, np.ones(5))
     assert_allclose(np.log10(found[:3] / unit), np.log10([1.0, 0.5, 10.0]), rtol=0, atol=1.0)
     assert 0.1 < found[3] / unit < 1e4  # by steps of 1e-4 of it, flat
     assert found[4] == 1.0  # on which nothing depends
 
 
 def describe(fun: object, x: np.ndarray, bounds: Bounds | None = None) -> MaxOfFunctions:
-    return MaxOfFunctions.describe(x, CountedFunction(fun), "cs", bounds, [])
+    return MaxOfFunctions.from_functions(x, CountedFunction(fun), "cs", bounds, [])
 
 
 @pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])

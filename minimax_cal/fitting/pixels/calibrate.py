@@ -9,51 +9,71 @@ from pathlib import Path
 
 import numpy as np
 
-from minimax_cal.fitting.accuracy import accuracy, by_key
-from minimax_cal.fitting.claims import drawn_sigmas
-from minimax_cal.fitting.outcome import FitEvidence, judge
-from minimax_cal.fitting.pixels.beside import FittedImages, as_instrument, fitted_on
-from minimax_cal.fitting.pixels.fit import PixelFit
-from minimax_cal.fitting.pixels.judge import (
-    Drawing,
-    Uncertainty,
-    arms_apart,
-    drawn_sigma,
-    position_sigma,
-    scale_of,
-    uncertainty_of,
+from minimax_cal.core.arrays import Array
+from minimax_cal.core.option_fields import take_option_fields_as_keywords
+from minimax_cal.core.progress_stages import Progress, silent_progress
+from minimax_cal.core.threads import limit_blas_to_one_thread
+from minimax_cal.fitting.accuracy import split_errors_by_key, summarise_point_errors
+from minimax_cal.fitting.accuracy_claims import nominal_link_sigmas
+from minimax_cal.fitting.multi_instrument.instrument_fit import minimise_worst_rows
+from minimax_cal.fitting.multi_instrument.instrument_stack import InstrumentBlock, InstrumentStack
+from minimax_cal.fitting.multi_instrument.options import RELATIVE_OPTION_READERS, SUM
+from minimax_cal.fitting.multi_instrument.relative_calibration import (
+    RelativeTask,
+    build_relative_result,
+    measure_instrument_errors,
+    rms_and_largest,
 )
-from minimax_cal.fitting.pixels.options import FIELDS, WORST_CAMERA, PixelOptions, check_options
-from minimax_cal.fitting.pixels.plausible import file_notices, objection, outlier_notices
-from minimax_cal.fitting.several.fit import at_worst
-from minimax_cal.fitting.several.kinds import Asked, assembled, extremes, measured_by
-from minimax_cal.fitting.several.options import READ, SUM
-from minimax_cal.fitting.several.result import Claim, PixelCalibration
-from minimax_cal.fitting.several.stack import Block, Stack
-from minimax_cal.fitting.several.worst import WorstPixels
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.options import takes
-from minimax_cal.ground.stages import Progress, silent
-from minimax_cal.ground.threads import one_thread
-from minimax_cal.instruments.camera import FLANGE, read_camera
-from minimax_cal.instruments.pixels import PixelData, read_pixels
-from minimax_cal.measuring.checks import arm_notices, check_joints
-from minimax_cal.measuring.grouping import groups, held_out
-from minimax_cal.measuring.measurements import TOOL, SetAside
+from minimax_cal.fitting.multi_instrument.relative_result import PixelCalibration, PositionClaim
+from minimax_cal.fitting.multi_instrument.worst_rows import WorstPixels
+from minimax_cal.fitting.outcome import FitEvidence, judge
+from minimax_cal.fitting.pixels.fit import PixelFit
+from minimax_cal.fitting.pixels.image_instrument import (
+    FittedImages,
+    as_image_instrument,
+    fit_with_camera_mount,
+)
+from minimax_cal.fitting.pixels.options import (
+    PIXEL_OPTION_NAMES,
+    WORST_CAMERA,
+    PixelOptions,
+    check_pixel_options,
+)
+from minimax_cal.fitting.pixels.pixel_slips import (
+    describe_pixel_objection,
+    list_file_notices,
+    list_outlier_pixel_notices,
+)
+from minimax_cal.fitting.pixels.pixel_uncertainty import (
+    NominalLinks,
+    PixelUncertainty,
+    calibrated_position_sigma,
+    estimate_pixel_uncertainty,
+    fit_length_scale,
+    nominal_position_sigma,
+    rms_difference_of_arms,
+)
+from minimax_cal.instruments.camera_model import CAMERA_ON_FLANGE, read_camera_file
+from minimax_cal.instruments.pixel_data import PixelData, read_pixel_data
+from minimax_cal.measuring.measurement_checks import check_and_complete_joints, list_robot_notices
+from minimax_cal.measuring.measurements import SET_ASIDE_BY_TOOL, SetAsidePoint
+from minimax_cal.measuring.pose_groups import group_repeated_poses, select_holdout_rows
 from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.solvers.status import Status
 
-MAX_ROUNDING = 1e-6  # an error below is rounding: pixels that were computed, not seen [px]
+MAX_ROUNDING_PX = 1e-6  # an error below is rounding: pixels that were computed, not seen [px]
 
 
-@takes(options=(PixelOptions, FIELDS), read=READ)
+@take_option_fields_as_keywords(
+    options=(PixelOptions, PIXEL_OPTION_NAMES), readers_by_field=RELATIVE_OPTION_READERS
+)
 def calibrate_pixels(
     robot: Robot | str | Path,
     pixels: Path | str,
     joints: Path | str,
     camera: Mapping[str, Path | str],
     board: Path | str | None = None,
-    progress: Progress = silent,
+    progress: Progress = silent_progress,
     *,
     options: PixelOptions,
 ) -> PixelCalibration:
@@ -93,86 +113,109 @@ def calibrate_pixels(
     >>> fit = mc.calibrate_pixels("ur5", "detections.csv", "joints.csv", {"cam": "camera.yaml"})
     """
     began = time.perf_counter()
-    check_options(options)
+    check_pixel_options(options)
     robot = load_robot(robot)
-    cameras = [read_camera(name, path) for name, path in camera.items()]
-    data = read_pixels(pixels, joints, cameras, board)
-    data = replace(data, at=check_joints(robot, data.at))
-    return fitted(robot, data, options, progress, began)
+    cameras = [read_camera_file(name, path) for name, path in camera.items()]
+    data = read_pixel_data(pixels, joints, cameras, board)
+    data = replace(data, at=check_and_complete_joints(robot, data.at))
+    return calibrate_pixel_data(robot, data, options, progress, began)
 
 
-@one_thread()
-def fitted(
+@limit_blas_to_one_thread()
+def calibrate_pixel_data(
     robot: Robot,
     data: PixelData,
     options: PixelOptions,
-    progress: Progress = silent,
-    began: float | None = None,
+    progress: Progress = silent_progress,
+    start_time: float | None = None,
 ) -> PixelCalibration:
     """As `calibrate_pixels`, of measurements that are read."""
-    began = time.perf_counter() if began is None else began
-    return concluded(determined(robot, data, options, progress), options, began)
+    start_time = time.perf_counter() if start_time is None else start_time
+    return conclude_pixel_calibration(
+        fit_and_estimate_uncertainty(robot, data, options, progress), options, start_time
+    )
 
 
 @dataclass(frozen=True, eq=False)
-class Determined:
+class PixelDetermination:
     """What pixels determine.  held: (m,) poses left out."""
 
     robot: Robot
     data: PixelData
     held: Array
     fit: PixelFit
-    sure: Uncertainty
+    sure: PixelUncertainty
     notices: tuple[str, ...]
 
 
-def determined(
-    robot: Robot, data: PixelData, options: PixelOptions, progress: Progress = silent
-) -> Determined:
+def fit_and_estimate_uncertainty(
+    robot: Robot, data: PixelData, options: PixelOptions, progress: Progress = silent_progress
+) -> PixelDetermination:
     """The fit of pixels, and how sure it is."""
-    held, said = held_out(data.at, options.holdout, options.seed)
-    train = data.some(~held[data.pose])
+    held, said = select_holdout_rows(data.at, options.holdout, options.seed)
+    train = data.take_pixels(~held[data.pose])
     progress("start")
-    fit = of_worst(fitted_on(robot, train, options, progress), options)
+    fit = minimise_worst_pixels(fit_with_camera_mount(robot, train, options, progress), options)
     progress("sigmas")
-    _, group = np.unique(groups(data.at)[train.pose], return_inverse=True)
-    return Determined(robot, data, held, fit, uncertainty_of(robot, fit, group.reshape(-1)), said)
+    _, group = np.unique(group_repeated_poses(data.at)[train.pose], return_inverse=True)
+    return PixelDetermination(
+        robot, data, held, fit, estimate_pixel_uncertainty(robot, fit, group.reshape(-1)), said
+    )
 
 
-def of_worst(fit: PixelFit, options: PixelOptions) -> PixelFit:
+def minimise_worst_pixels(fit: PixelFit, options: PixelOptions) -> PixelFit:
     """The minimax from a fit of the sum, where the objective asks for one.
 
     f_i is the mean square of the pixels of one target in one camera, or of one camera.
     """
-    if options.objective == SUM or fit.found.status[0] is Status.FAILED:
+    if options.objective == SUM or fit.least_squares.status[0] is Status.FAILED:
         return fit
     data = fit.images.pixels
-    of, names = data.part, data.parts
+    of, names = data.part_of_pixels, data.part_names
     if options.objective == WORST_CAMERA:
         of, names = data.camera, tuple(camera.name for camera in data.cameras)
-    of = np.where(fit.images.counted, of, -1)
-    rows = np.concatenate([of, of, np.full(fit.images.lens_rows, -2)])
-    fit, share = at_worst(fit, rows, names, 2, options.qp, MAX_ROUNDING, WorstPixels)
-    return replace(fit, share=share[: data.count])
+    of = np.where(fit.images.counted_pixel_mask, of, -1)
+    rows = np.concatenate([of, of, np.full(fit.images.lens_row_count, -2)])
+    fit, share = minimise_worst_rows(fit, rows, names, 2, options.qp, MAX_ROUNDING_PX, WorstPixels)
+    return replace(fit, share=share[: data.pixel_count])
 
 
-def concluded(one: Determined, options: PixelOptions, began: float) -> PixelCalibration:
-    """The result: whether to use the arm, and how good it is.  began: by `time.perf_counter`."""
-    robot, data, held, fit, sure = one.robot, one.data, one.held, one.fit, one.sure
+def conclude_pixel_calibration(
+    determination: PixelDetermination, options: PixelOptions, start_time: float
+) -> PixelCalibration:
+    """The result: whether to use the arm, and how good it is.  start_time: by
+    `time.perf_counter`.
+    """
+    robot, data, held, fit, sure = (
+        determination.robot,
+        determination.data,
+        determination.held,
+        determination.fit,
+        determination.sure,
+    )
     among = np.arange(5 * robot.joints) >= 2 * robot.joints * fit.by_drawing  # lengths are in it
-    scale, drawing = scale_of(robot, fit, sure), Drawing.of(robot, fit, sure, among)
+    scale, drawing = (
+        fit_length_scale(robot, fit, sure),
+        NominalLinks.from_fit(robot, fit, sure, among),
+    )
     if options.drawn_prior:
-        fit, sure = drawing.beside(fit, sure)
-    images = FittedImages.of(robot, fit)
-    stack = Stack.of(robot, [images], [images.kind])
+        fit, sure = drawing.with_nominal_prior(fit, sure)
+    images = FittedImages.from_fit(robot, fit)
+    stack = InstrumentStack.from_instruments(robot, [images], [images.kind])
     found = replace(fit, problem=replace(fit.problem, stack=stack), covariance=sure.covariance,
                     noise=images.metre * fit.noise)  # fmt: skip
-    plain = as_instrument(data)
-    asked, every = Asked(robot, [plain], options, [(held, one.notices)]), images.at_rows_of(plain)
-    counts, wrong = every.counting(held)
-    arms = [Block.of(robot, every).at(x) for x in (fit.nominal, fit.state)]
-    before, after = (np.linalg.norm(every.off(*arm), axis=0)[counts] for arm in arms)
-    measured = measured_by(robot, found, 0, plain, held)
+    plain = as_image_instrument(data)
+    asked, every = (
+        RelativeTask(robot, [plain], options, [(held, determination.notices)]),
+        images.copy_choices_to(plain),
+    )
+    counts, wrong = every.split_counted_pixels(held)
+    arms = [
+        InstrumentBlock.without_effects(robot, every).flange_and_own_values(x)
+        for x in (fit.nominal, fit.state)
+    ]
+    before, after = (np.linalg.norm(every.pixel_errors(*arm), axis=0)[counts] for arm in arms)
+    measured = measure_instrument_errors(robot, found, 0, plain, held)
     scaled = {"lengths_over_drawn": {"share": scale.share, "sigma": scale.sigma}} if scale else {}
     measured = replace(
         measured,
@@ -180,7 +223,7 @@ def concluded(one: Determined, options: PixelOptions, began: float) -> PixelCali
         instrument={**measured.instrument, **scaled},
     )
     arm = robot.with_mdh(fit.state.mdh)
-    claim = claimed(robot, arm, sure, drawing.share)
+    claim = build_position_claim(robot, arm, sure, drawing.variance_fraction)
     links = slice(5 * robot.joints)
     fits_links = fit.problem.active[links].any()
     evidence = FitEvidence(
@@ -189,45 +232,65 @@ def concluded(one: Determined, options: PixelOptions, began: float) -> PixelCali
         fit.problem.active[links],
         (),
         sigma=np.sqrt(np.maximum(np.diag(sure.covariance)[links], 0.0)),
-        drawn=drawn_sigmas(robot),
+        drawn=nominal_link_sigmas(robot),
         position_sigma=claim.sigma,
         drawn_sigma=claim.drawn,
         allow_large_changes=options.allow_large_changes,
-        objection=objection(robot, fit, scale),
+        objection=describe_pixel_objection(robot, fit, scale),
         worse=claim.why_kept() if fits_links and not claim.is_better else "",
     )
-    ended = judge(evidence, fit.found.status[0])
-    told = () if ended.status is Status.FAILED else file_notices(fit, scale)
+    ended = judge(evidence, fit.least_squares.status[0])
+    told = () if ended.status is Status.FAILED else list_file_notices(fit, scale)
     aside = np.flatnonzero(wrong)
-    return assembled(
-        asked, found, [measured], began, PixelCalibration,
+    return build_relative_result(
+        asked,
+        found,
+        [measured],
+        start_time,
+        PixelCalibration,
         robot=robot if ended.status.keeps_drawn else arm,
         status=ended.status,
         position_sigma=claim.sigma,
         notices=(
-            *data.notices, *arm_notices(robot, data.at), *one.notices, *fit.notices,
-            *notices_of(fit, held), *told, *outlier_notices(data, aside),
+            *data.notices,
+            *list_robot_notices(robot, data.at),
+            *determination.notices,
+            *fit.notices,
+            *list_pixel_notices(fit, held),
+            *told,
+            *list_outlier_pixel_notices(data, aside),
         ),
         calibrated=arm,
-        pixels=extremes(by_key(before, after, held[data.pose][counts])),
+        pixels=rms_and_largest(split_errors_by_key(before, after, held[data.pose][counts])),
         claim=claim,
-        set_aside=set_aside(data, aside),
-        with_them=accuracy(every.table(*arms[1], counts | wrong)[held]) if len(aside) else None,
+        set_aside=list_set_aside_pixels(data, aside),
+        with_them=summarise_point_errors(
+            every.target_errors_by_part(*arms[1], counts | wrong)[held]
+        )
+        if len(aside)
+        else None,
         reason=ended.reason,
-    )  # fmt: skip
+    )
 
 
-def claimed(robot: Robot, arm: Robot, sure: Uncertainty, share: float) -> Claim:
-    """What is known of the drawn and the calibrated arm.  share: as in `Drawing`."""
-    shown = drawn_sigma(robot, sure.lack, share) if share else 0.0
-    drawn = drawn_sigma(robot, sure.lack)
-    return Claim(position_sigma(arm, sure), drawn, arms_apart(robot, arm), shown)
+def build_position_claim(
+    robot: Robot, arm: Robot, uncertainty: PixelUncertainty, share: float
+) -> PositionClaim:
+    """What is known of the drawn and the calibrated arm.  share: as in `NominalLinks`."""
+    shown = nominal_position_sigma(robot, uncertainty.lack, share) if share else 0.0
+    drawn = nominal_position_sigma(robot, uncertainty.lack)
+    return PositionClaim(
+        calibrated_position_sigma(arm, uncertainty),
+        drawn,
+        rms_difference_of_arms(robot, arm),
+        shown,
+    )
 
 
-def notices_of(fit: PixelFit, held: Array) -> list[str]:
+def list_pixel_notices(fit: PixelFit, is_held: Array) -> list[str]:
     """What the reader should know: the scale, the lenses, nothing held out."""
     out = []
-    on = FLANGE if fit.images.on_flange else "ground"
+    on = CAMERA_ON_FLANGE if fit.images.on_flange else "ground"
     out.append(f"the cameras are taken as fixed to the {on}")
     if fit.by_drawing:
         out.append(
@@ -237,20 +300,20 @@ def notices_of(fit: PixelFit, held: Array) -> list[str]:
     if fit.held:
         known = "their doubt counts in every sigma" if fit.lens_sigma.any() else "as known"
         out.append(f"the lenses are held as their files say, {known}")
-    if not held.any():
+    if not is_held.any():
         out.append("no pose is held out: nothing here says how the fit does on new poses")
     return out
 
 
-def set_aside(data: PixelData, rows: Array) -> tuple[SetAside, ...]:
+def list_set_aside_pixels(data: PixelData, rows: Array) -> tuple[SetAsidePoint, ...]:
     """The pixels that took no part."""
     return tuple(
-        SetAside(
+        SetAsidePoint(
             row=int(data.line[row]),
             pose=int(data.pose[row]) + 1,
             target=data.targets[data.target[row]],
             why="the pixel is an outlier",
-            by=TOOL,
+            by=SET_ASIDE_BY_TOOL,
         )
         for row in rows
     )

@@ -9,43 +9,56 @@ from pathlib import Path
 
 import numpy as np
 
+from minimax_cal.core.arrays import Array
+from minimax_cal.core.errors import OptionError
+from minimax_cal.fitting.multi_instrument.options import (
+    CAMERA_OPTION_GROUP,
+    SUM,
+    WORST_TARGET,
+    RelativeOptions,
+)
 from minimax_cal.fitting.options import check_resolution
-from minimax_cal.fitting.several.options import SUM, WORST_TARGET, RelativeOptions, seen
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import OptionError
-from minimax_cal.instruments.camera import FLANGE, GROUND, INTRINSICS
-from minimax_cal.instruments.images import Images
-from minimax_cal.reading.rows import Rows
+from minimax_cal.instruments.camera_images import CameraImages
+from minimax_cal.instruments.camera_model import (
+    CAMERA_ON_FLANGE,
+    CAMERA_ON_GROUND,
+    FITTED_INTRINSICS,
+)
+from minimax_cal.reading.measurement_table import MeasurementTable
 
 WORST_CAMERA = "camera"
-OBJECTIVES = (SUM, WORST_TARGET, WORST_CAMERA)
+PIXEL_OBJECTIVES = (SUM, WORST_TARGET, WORST_CAMERA)
 # How well a camera's file knows its lens: a share of the focal length, pixels of the centre, and
 # the first radial and both tangential coefficients; higher radial ones are known worse.
-DOUBTS = {"f": 1e-3, "c": 2.0, "k": 5e-3, "p": 5e-4}
-SHARES = {  # of each intrinsic: which doubt it has, and how many times
+DEFAULT_LENS_SIGMAS = {"f": 1e-3, "c": 2.0, "k": 5e-3, "p": 5e-4}
+LENS_SIGMA_SCALES = {  # of each intrinsic: which doubt it has, and how many times
     "fx": ("f", 1.0), "fy": ("f", 1.0), "cx": ("c", 1.0), "cy": ("c", 1.0), "k1": ("k", 1.0),
     "k2": ("k", 5.0), "k3": ("k", 10.0), "p1": ("p", 1.0), "p2": ("p", 1.0),
 }  # fmt: skip
-UNITS = {"f": ("%", 0.01), "c": ("px", 1.0), "k": ("", 1.0), "p": ("", 1.0)}
-PIXELS = {"u_px", "v_px"}  # columns of what cameras saw
-ITEM = re.compile(r"\s*([fckp])\s+([\d.]+(?:[eE][-+]?\d+)?)\s*(%|px)?\s*")
+LENS_SIGMA_UNITS = {"f": ("%", 0.01), "c": ("px", 1.0), "k": ("", 1.0), "p": ("", 1.0)}
+PIXEL_COLUMNS = {"u_px", "v_px"}  # columns of what cameras saw
+LENS_SIGMA_PATTERN = re.compile(r"\s*([fckp])\s+([\d.]+(?:[eE][-+]?\d+)?)\s*(%|px)?\s*")
 
 
-def doubts_of(text: str) -> Mapping[str, float]:
+def parse_lens_sigmas(text: str) -> Mapping[str, float]:
     """How well a lens is known, from a text as ``f 0.1%, c 2px``.  Raises OptionError."""
-    found = dict(DOUBTS)
+    found = dict(DEFAULT_LENS_SIGMAS)
     for part in filter(str.strip, text.split(",")):
-        match = ITEM.fullmatch(part)
-        if not match or (match[3] or "") != UNITS[match[1]][0] or not float(match[2]) > 0.0:
+        match = LENS_SIGMA_PATTERN.fullmatch(part)
+        if (
+            not match
+            or (match[3] or "") != LENS_SIGMA_UNITS[match[1]][0]
+            or not float(match[2]) > 0.0
+        ):
             raise OptionError(
                 f"camera_prior={text!r}: write f in %, c in px, k and p as they are, all more than "
                 "0, as 'f 0.1%, c 2px'"
             )
-        found[match[1]] = float(match[2]) * UNITS[match[1]][1]
+        found[match[1]] = float(match[2]) * LENS_SIGMA_UNITS[match[1]][1]
     return found
 
 
-def cameras_of(texts: Sequence[str]) -> dict[str, str]:
+def parse_camera_files(texts: Sequence[str]) -> dict[str, str]:
     """Files by the cameras' names, of NAME=FILE each.  Raises OptionError."""
     named = {}
     for text in texts:
@@ -62,23 +75,23 @@ def cameras_of(texts: Sequence[str]) -> dict[str, str]:
 class PixelFiles:
     """What is given of cameras."""
 
-    pixels: Path | None = seen(  # noqa: RUF009
+    pixels: Path | None = CAMERA_OPTION_GROUP(  # noqa: RUF009
         None, "What cameras saw (CSV): pose, camera, target, u_px, v_px.", metavar="FILE", read=Path
     )
-    joints: Path | None = seen(  # noqa: RUF009
+    joints: Path | None = CAMERA_OPTION_GROUP(  # noqa: RUF009
         None,
         "The joint values of each pose of the detections (CSV): pose, q1_rad, ...",
         metavar="FILE",
         read=Path,
     )
-    camera: Sequence[str] = seen(
+    camera: Sequence[str] = CAMERA_OPTION_GROUP(
         (),
         "The K and D of a camera, as OpenCV or ROS write them (YAML); may be given several times.",
         metavar="NAME=FILE",
         read=str,
         many=tuple,
     )
-    board: Path | None = seen(  # noqa: RUF009
+    board: Path | None = CAMERA_OPTION_GROUP(  # noqa: RUF009
         None,
         "The places of the targets on a board (CSV): target, x_mm, y_mm, z_mm [default: tags of "
         "unknown place].",
@@ -87,13 +100,15 @@ class PixelFiles:
     )
 
     @property
-    def given(self) -> bool:
+    def is_given(self) -> bool:
         """Whether anything is."""
         return any(vars(self).values())
 
-    def among(self, data: Sequence[Rows]) -> tuple[PixelFiles, list[Rows]]:
+    def find_in_data(
+        self, data: Sequence[MeasurementTable]
+    ) -> tuple[PixelFiles, list[MeasurementTable]]:
         """The same with what cameras saw where it is a file of the data, and the other files."""
-        seen = [] if self.pixels else [one for one in data if {*one.given} >= PIXELS]
+        seen = [] if self.pixels else [one for one in data if {*one.given} >= PIXEL_COLUMNS]
         rest = [one for one in data if one not in seen]
         return (replace(self, pixels=Path(seen[0].path)) if seen else self), [*seen[1:], *rest]
 
@@ -101,19 +116,19 @@ class PixelFiles:
         """Detections, joints, cameras by name, board.  Raises OptionError."""
         if not (self.pixels and self.joints and self.camera):
             raise OptionError("cameras need all three of pixels=, joints= and camera='NAME=FILE'")
-        return self.pixels, self.joints, cameras_of(self.camera), self.board
+        return self.pixels, self.joints, parse_camera_files(self.camera), self.board
 
 
-OF_CAMERAS = (*Images.options, "drawn_prior")
-FIELDS = (  # that are of pixels
-    "objective", "qp", *OF_CAMERAS, "holdout", "seed", "fix", "free", "resolution",
+CAMERA_OPTION_NAMES = (*CameraImages.options, "drawn_prior")
+PIXEL_OPTION_NAMES = (  # that are of pixels
+    "objective", "qp", *CAMERA_OPTION_NAMES, "holdout", "seed", "fix", "free", "resolution",
     "allow_large_changes",
 )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class PixelOptions(RelativeOptions):
-    """How to calibrate, by `FIELDS`.
+    """How to calibrate, by `PIXEL_OPTION_NAMES`.
 
     objective: sum, minimax (the worst target) or camera (the worst camera).
     qp: backend of the minimax QPs.  camera_on: flange or ground; what fits better unless given.
@@ -126,34 +141,38 @@ class PixelOptions(RelativeOptions):
     allow_large_changes: accept an arm that is another than the one drawn.
     """
 
-    drawn_prior: bool = seen(
+    drawn_prior: bool = CAMERA_OPTION_GROUP(
         False, "Take the drawing as a prior, as well as the robot's drawn_within says or better."
     )
 
     def settings(self) -> dict[str, object]:
         """For the record."""
         every = super().settings()
-        return {name: every[name] for name in FIELDS}
+        return {name: every[name] for name in PIXEL_OPTION_NAMES}
 
     def lens_sigma(self, intrinsic: Array) -> Array:
         """(c, 9) standard deviations of the lenses.  intrinsic: (c, 16)."""
-        doubts = doubts_of(self.camera_prior)
-        sigma = np.array([times * doubts[kind] for kind, times in map(SHARES.get, INTRINSICS)])  # type: ignore[misc]
+        doubts = parse_lens_sigmas(self.camera_prior)
+        scales = [LENS_SIGMA_SCALES[name] for name in FITTED_INTRINSICS]
+        sigma = np.array([times * doubts[kind] for kind, times in scales])
         every = np.tile(sigma, (len(intrinsic), 1))
         every[:, :2] *= intrinsic[:, :2]
         return every
 
 
-def check_options(options: PixelOptions) -> None:
+def check_pixel_options(options: PixelOptions) -> None:
     """Raise OptionError for a choice that does not exist."""
-    if options.objective not in OBJECTIVES:
+    if options.objective not in PIXEL_OBJECTIVES:
         raise OptionError(
-            f"objective={options.objective!r} is not for pixels: give {', '.join(OBJECTIVES[:2])} "
-            f"or {OBJECTIVES[2]}"
+            f"objective={options.objective!r} is not for pixels: "
+            f"give {', '.join(PIXEL_OBJECTIVES[:2])} "
+            f"or {PIXEL_OBJECTIVES[2]}"
         )
     if options.objective != SUM and options.drawn_prior:
         raise OptionError(f"drawn_prior= is for objective='{SUM}': leave one of them out")
-    if options.camera_on not in ("", FLANGE, GROUND):
-        raise OptionError(f"camera_on={options.camera_on!r}: give {FLANGE} or {GROUND}")
+    if options.camera_on not in ("", CAMERA_ON_FLANGE, CAMERA_ON_GROUND):
+        raise OptionError(
+            f"camera_on={options.camera_on!r}: give {CAMERA_ON_FLANGE} or {CAMERA_ON_GROUND}"
+        )
     check_resolution(options.resolution)
-    doubts_of(options.camera_prior)
+    parse_lens_sigmas(options.camera_prior)

@@ -10,35 +10,64 @@ from typing import Any
 
 import numpy as np
 
-from minimax_cal.ground.errors import DataError, OptionError
-from minimax_cal.ground.files import write_whole
-from minimax_cal.ground.tables import Table
-from minimax_cal.measuring.faults import distance_faults
-from minimax_cal.measuring.importers import cmm, programs, tables
-from minimax_cal.measuring.importers.assemble import Assembly, assemble
-from minimax_cal.measuring.importers.join import SAME
-from minimax_cal.measuring.importers.tables import Given, Reading
+from minimax_cal.core.errors import DataError, OptionError
+from minimax_cal.core.files import write_file_atomically
+from minimax_cal.core.tables import Table
+from minimax_cal.measuring.faults import find_faults_by_distances
+from minimax_cal.measuring.file_mistakes import apply_mends
+from minimax_cal.measuring.importers import cmm_reports, column_tables, robot_programs
+from minimax_cal.measuring.importers.assemble import ImportAssembly, assemble_measurements
+from minimax_cal.measuring.importers.column_tables import ImportedTable, ImportOptions
+from minimax_cal.measuring.importers.point_pose_matching import SAME_ROW
 from minimax_cal.measuring.measurements import (
     Measurements,
-    check_finite,
-    measurements_text,
-    without_blind,
+    check_measurements,
+    drop_rows_without_targets,
+    format_measurements_csv,
 )
-from minimax_cal.measuring.set_aside import left_out, whole
-from minimax_cal.measuring.slips import mended
-from minimax_cal.reading.sheet import DECIMALS, DELIMITERS, Sheet, cut, open_text
-from minimax_cal.reading.words import ANGLES, LENGTHS, TEMPERATURES, TIMES
+from minimax_cal.measuring.set_aside_points import (
+    merge_set_aside_points_with_reasons,
+    set_aside_points_named_by_user,
+)
+from minimax_cal.reading.column_words import (
+    COLUMN_SECONDS_PER_TIME_UNIT,
+    METRES_PER_LENGTH_UNIT,
+    RADIANS_PER_ANGLE_UNIT,
+    TEMPERATURE_UNITS,
+)
+from minimax_cal.reading.text_sheet import (
+    DECIMAL_SIGN_NAMES,
+    DELIMITER_NAMES,
+    Sheet,
+    parse_sheet_table,
+    read_text_sheet,
+)
 
-__all__ = ["Given", "Imported", "import_files", "read_any", "save", "units_of"]
+__all__ = [
+    "ImportOptions",
+    "Imported",
+    "import_files",
+    "parse_unit_options",
+    "read_in_first_fitting_format",
+    "save",
+]
 
 # The first that fits a file is taken: of the text alone, then of its rows and columns.
-Read = Callable[[Sheet, Given, bool], Reading | None]  # None where a file is of another format
-OF_TEXT: tuple[Read, ...] = (programs.read, cmm.read)
-OF_ROWS: tuple[Read, ...] = (cmm.read, tables.read)
-MEASURED = re.compile(r"q\d*|(?:smr|base)\d*(?:_[xyz])?|qread\d*|u95|temperature|time")
-OF_JOINTS = re.compile(r"(?:^|[,=])\s*q\d*(?:_|\s*(?:,|$))")
-LAYOUTS = ("", "pose", "target")
-DATES = ("dmy", "mdy", "ymd")
+ReadTable = Callable[
+    [Sheet, ImportOptions, bool], ImportedTable | None
+]  # None where a file is of another format
+TEXT_IMPORTERS: tuple[ReadTable, ...] = (
+    robot_programs.import_robot_program,
+    cmm_reports.import_cmm_report,
+)
+TABLE_IMPORTERS: tuple[ReadTable, ...] = (
+    cmm_reports.import_cmm_report,
+    column_tables.import_table_by_header,
+)
+UNIT_OPTION_PATTERN = re.compile(r"q\d*|(?:smr|base)\d*(?:_[xyz])?|qread\d*|u95|temperature|time")
+JOINT_MAPPING_PATTERN = re.compile(r"(?:^|[,=])\s*q\d*(?:_|\s*(?:,|$))")
+LAYOUT_CHOICES = ("", "pose", "target")
+DATE_ORDERS = ("dmy", "mdy", "ymd")
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,24 +75,31 @@ class Imported:
     """data: the measurements.  assembly: every file and column, and how it was understood."""
 
     data: Measurements
-    assembly: Assembly
+    assembly: ImportAssembly
 
     def files(self) -> Table:
         """A row for each file."""
         rows = (
-            (s.path, r.format, DELIMITERS.get(s.delimiter, "-"), DECIMALS.get(s.decimal, "-"),
-             s.encoding, len(r.line), how)
+            (
+                s.path,
+                r.format,
+                DELIMITER_NAMES.get(s.delimiter, "-"),
+                DECIMAL_SIGN_NAMES.get(s.decimal, "-"),
+                s.encoding,
+                len(r.line),
+                how,
+            )
             for r, how in zip(self.assembly.readings, self.assembly.matched, strict=True)
             for s in [r.sheet]
-        )  # fmt: skip
+        )
         columns = "file | format | delimiter | decimal | encoding | rows | matched by"
-        return Table.made("files", rows, columns)
+        return Table.from_rows("files", rows, columns)
 
     def columns(self) -> tuple[Table, ...]:
         """A table for each file: its columns."""
         columns = "column.name=column | meaning | unit | known=known by | first=first row, SI"
         return tuple(
-            Table.of(str(r.sheet.path), meanings, columns)
+            Table.from_records(str(r.sheet.path), meanings, columns)
             for r, meanings in zip(self.assembly.readings, self.assembly.meanings, strict=True)
         )
 
@@ -83,7 +119,7 @@ class Imported:
         for name, column in data.columns.items():
             lines.append((name, "", *(str(column[row]) for row in some)))
         heads = (f"line {data.line[row]} .4f" for row in some)
-        return Table.made("rows as understood", lines, " | unit", *heads)
+        return Table.from_rows("rows as understood", lines, " | unit", *heads)
 
     def headline(self) -> str:
         """What came out, in a line."""
@@ -102,56 +138,67 @@ class Imported:
             f"{file['decimal']}, {file['encoding']}"
             + (
                 f", matched with {held} by {how}"
-                if (how := file["matched by"]) and how != SAME
+                if (how := file["matched by"]) and how != SAME_ROW
                 else ""
             )
-            for file in self.files().records()
+            for file in self.files().to_records()
         ]
         data = self.data
         told = replace(data, notices=(*data.notices, *said[:-1], f"{said[-1]}: {self.headline()}"))
-        return without_blind(told, np.zeros(data.poses, dtype=bool))
+        return drop_rows_without_targets(told, np.zeros(data.poses, dtype=bool))
 
-    def put_right(self, mend: Sequence[str], leave_out: Sequence[str]) -> Imported:
+    def with_mends(self, mend_texts: Sequence[str], left_out_points: Sequence[str]) -> Imported:
         """With mends made and points set aside; what then still looks wrong is a notice.
 
-        mend, leave_out: as of `mended` and `left_out`.  Raises CalibrationError.
+        mend_texts, left_out_points: as of `apply_mends` and `set_aside_points_named_by_user`.
+        Raises CalibrationError.
         """
-        data = left_out(mended(self.data, mend), leave_out)
-        check_finite(data)  # what is left of it
-        off = (fault.text for fault in distance_faults(data))
+        data = set_aside_points_named_by_user(apply_mends(self.data, mend_texts), left_out_points)
+        check_measurements(data)  # what is left of it
+        off = (fault.text for fault in find_faults_by_distances(data))
         return replace(self, data=replace(data, notices=(*data.notices, *off)))
 
     def csv(self) -> str:
         """The contract's CSV; what nothing uses is kept as text, points set aside with why."""
-        data = whole(self.data)
-        return measurements_text(replace(data, columns={**data.columns, **data.unknown}))
+        data = merge_set_aside_points_with_reasons(self.data)
+        return format_measurements_csv(replace(data, columns={**data.columns, **data.unknown}))
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
-        data, files = self.data, zip(self.files().records(), self.columns(), strict=True)
+        data, files = self.data, zip(self.files().to_records(), self.columns(), strict=True)
         return {
             "poses": data.poses,
             "joints": data.q.shape[1],
             "targets": data.target_names,
-            "files": [{**file, "columns": table.records()} for file, table in files],
+            "files": [{**file, "columns": table.to_records()} for file, table in files],
             "set_aside": data.set_aside,
             "notices": data.notices,
         }
 
 
-def units_of(given: str | Sequence[str] | Mapping[str, str]) -> Mapping[str, str]:
+def parse_unit_options(unit_texts: str | Sequence[str] | Mapping[str, str]) -> Mapping[str, str]:
     """Units by meaning, also from `q=deg,smr=mm`, or bare: `deg,mm`.  Raises OptionError."""
-    if isinstance(given, Mapping):
-        return given
-    found, texts = dict[str, str](), [given] if isinstance(given, str) else given
+    if isinstance(unit_texts, Mapping):
+        return unit_texts
+    found, texts = dict[str, str](), [unit_texts] if isinstance(unit_texts, str) else unit_texts
     for part in (p.strip() for text in texts for p in text.split(",") if p.strip()):
         name, equals, unit = part.rpartition("=")
         if not equals:
-            name = "q" if unit in ANGLES else "smr" if unit in LENGTHS else ""
-        kinds: Sequence[str] = (*ANGLES, *LENGTHS) if name.startswith("q") else tuple(LENGTHS)
-        kinds = TEMPERATURES if name == "temperature" else kinds
-        kinds = (*TIMES, *DATES) if name == "time" else kinds
-        known = bool(MEASURED.fullmatch(name))
+            name = (
+                "q"
+                if unit in RADIANS_PER_ANGLE_UNIT
+                else "smr"
+                if unit in METRES_PER_LENGTH_UNIT
+                else ""
+            )
+        kinds: Sequence[str] = (
+            (*RADIANS_PER_ANGLE_UNIT, *METRES_PER_LENGTH_UNIT)
+            if name.startswith("q")
+            else tuple(METRES_PER_LENGTH_UNIT)
+        )
+        kinds = TEMPERATURE_UNITS if name == "temperature" else kinds
+        kinds = (*COLUMN_SECONDS_PER_TIME_UNIT, *DATE_ORDERS) if name == "time" else kinds
+        known = bool(UNIT_OPTION_PATTERN.fullmatch(name))
         if not known or unit not in kinds:
             ways = [f"{name}={k}" for k in kinds] if known else ["q=deg", "smr=mm", "time=dmy"]
             raise OptionError(f"units={part!r}: write {', '.join(ways[:-1])} or {ways[-1]}")
@@ -160,28 +207,31 @@ def units_of(given: str | Sequence[str] | Mapping[str, str]) -> Mapping[str, str
     return found
 
 
-def read_any(path: Path | str | Sheet, given: Given, *, joints: bool = False) -> Reading:
-    """A file in the first format that fits.  joints: the user said that it holds joint values.
+def read_in_first_fitting_format(
+    path: Path | str | Sheet, options: ImportOptions, *, holds_joints: bool = False
+) -> ImportedTable:
+    """A file in the first format that fits.  holds_joints: the user said that it holds joint
+    values.
 
     Raises DataError with what to add.
     """
-    sheet = open_text(path)
-    given = replace(given, columns=given.joint_columns if joints else given.columns)
-    if not given.columns:
-        for read in OF_TEXT:
-            if found := read(sheet, given, joints):
+    sheet = read_text_sheet(path)
+    options = replace(options, columns=options.joint_columns if holds_joints else options.columns)
+    if not options.columns:
+        for read in TEXT_IMPORTERS:
+            if found := read(sheet, options, holds_joints):
                 return found
-    sheet = cut(sheet, given.decimal)
-    ways = (tables.mapped,) if given.columns else OF_ROWS
-    reading = next(filter(None, (read(sheet, given, joints) for read in ways)), None)
+    sheet = parse_sheet_table(sheet, options.decimal)
+    ways = (column_tables.import_table_by_mapping,) if options.columns else TABLE_IMPORTERS
+    reading = next(filter(None, (read(sheet, options, holds_joints) for read in ways)), None)
     if reading is None:
-        raise DataError(unknown(sheet))
-    return replace(reading, notices=(*reading.notices, *sheet.left_out()))
+        raise DataError(describe_unknown_format(sheet))
+    return replace(reading, notices=(*reading.notices, *sheet.list_left_out_notices()))
 
 
-def unknown(sheet: Sheet) -> str:
+def describe_unknown_format(sheet: Sheet) -> str:
     """A format that nobody knows: what to add."""
-    w = sheet.width
+    w = sheet.column_count
     if sheet.header:
         names = ", ".join(sheet.header[:6])
         return (
@@ -233,15 +283,15 @@ def import_files(
     """
     if not files:
         raise OptionError("name a file to import")
-    given = given_by(columns, units, layout, decimal, apart=joints is not None)
-    readings = [read_any(path, given) for path in files]
-    check_twice(readings)
-    points = [reading for reading in readings if reading.smrs]
-    held = file_of_joints(joints, readings, given)
+    given = build_import_options(columns, units, layout, decimal, has_joint_file=joints is not None)
+    readings = [read_in_first_fitting_format(path, given) for path in files]
+    check_no_duplicate_point_files(readings)
+    points = [reading for reading in readings if reading.target_numbers]
+    held = find_joint_table(joints, readings, given)
     where = held.sheet.path
     if not points:
         raise DataError(f"{where}: holds joint values but no points; add the tracker's file")
-    neither = [r.sheet.path for r in readings if not (r.smrs or r.joints)]
+    neither = [r.sheet.path for r in readings if not (r.target_numbers or r.joint_columns)]
     if neither:
         raise DataError(f"{neither[0]}: holds neither points nor joint values")
     other = next((r.sheet.path for r in points if r is not held and held in points), None)
@@ -249,37 +299,39 @@ def import_files(
         raise DataError(
             f"{other}: holds points without joints, but {where} holds both; import it alone"
         )
-    assembly = assemble(points, held, given)
+    assembly = assemble_measurements(points, held, given)
     return Imported(assembly.data, assembly)
 
 
-def check_twice(readings: Sequence[Reading]) -> None:
+def check_no_duplicate_point_files(tables: Sequence[ImportedTable]) -> None:
     """Raise DataError where two files of points are one: they would be two targets in one place."""
     texts: dict[str, Path] = {}
-    for path, text in ((r.sheet.path, r.sheet.text) for r in readings if r.smrs):
+    for path, text in ((r.sheet.path, r.sheet.text) for r in tables if r.target_numbers):
         first = texts.setdefault(text, path)
         if first is not path:
             what = "is given twice" if first == path else f"holds the same points as {first}"
             raise DataError(f"{path}: {what}; give each target's file once")
 
 
-def given_by(
+def build_import_options(
     columns: str | Sequence[str],
     units: str | Sequence[str] | Mapping[str, str],
     layout: str,
     decimal: str,
     *,
-    apart: bool = False,
-) -> Given:
+    has_joint_file: bool = False,
+) -> ImportOptions:
     """What the user says about files.  Raises OptionError."""
-    if layout not in LAYOUTS:
+    if layout not in LAYOUT_CHOICES:
         raise OptionError(f"layout={layout!r}: write pose or target")
-    sign = {name: sign for sign, name in DECIMALS.items()}.get(decimal, decimal)
-    if sign not in ("", *DECIMALS):
+    sign = {name: sign for sign, name in DECIMAL_SIGN_NAMES.items()}.get(decimal, decimal)
+    if sign not in ("", *DECIMAL_SIGN_NAMES):
         raise OptionError(f"decimal={decimal!r}: write comma or point")
     mappings = [columns] if isinstance(columns, str) else list(columns)
     of_joints = [
-        text for text in mappings if apart and "smr" not in text and OF_JOINTS.search(text)
+        text
+        for text in mappings
+        if has_joint_file and "smr" not in text and JOINT_MAPPING_PATTERN.search(text)
     ]
     others = [text for text in mappings if text and text not in of_joints]
     if len(others) > 1 or len(of_joints) > 1:
@@ -287,23 +339,30 @@ def given_by(
             "columns=: two mappings of one file; give one for the points and, with joints=, one "
             "for the joints"
         )
-    return Given("".join(others), "".join(of_joints), units_of(units), layout, sign)
+    return ImportOptions(
+        "".join(others), "".join(of_joints), parse_unit_options(units), layout, sign
+    )
 
 
-def file_of_joints(path: Path | str | None, readings: Sequence[Reading], given: Given) -> Reading:
+def find_joint_table(
+    joint_path: Path | str | None, imported_tables: Sequence[ImportedTable], options: ImportOptions
+) -> ImportedTable:
     """The file of joint values: that of the path, or the only one that holds some.
 
     Raises DataError.
     """
-    turns = [reading for reading in readings if reading.joints]
+    turns = [reading for reading in imported_tables if reading.joint_columns]
     others = [reading.sheet.path for reading in turns]
-    if path is not None:
-        held = read_any(path, given, joints=True)
-        if not held.joints:
-            raise DataError(f"{path}: holds no joint values; name its columns q1_deg, q2_deg ...")
+    if joint_path is not None:
+        held = read_in_first_fitting_format(joint_path, options, holds_joints=True)
+        if not held.joint_columns:
+            raise DataError(
+                f"{joint_path}: holds no joint values; name its columns q1_deg, q2_deg ..."
+            )
         if turns:
             raise DataError(
-                f"{others[0]}: holds joint values, as joints={str(path)!r} does; leave one of "
+                f"{others[0]}: holds joint values, as "
+                f"joints={str(joint_path)!r} does; leave one of "
                 "them out"
             )
         return held
@@ -312,15 +371,15 @@ def file_of_joints(path: Path | str | None, readings: Sequence[Reading], given: 
             f"{others[1]}: holds joint values, as {others[0]} does; import one at a time, or name "
             "the file of joints as joints="
         )
-    points = [reading for reading in readings if reading.smrs]
+    points = [reading for reading in imported_tables if reading.target_numbers]
     if not turns:
         lacks = "points but no joint values; add their file as joints="
         neither = "neither points nor joint values; say what its columns are as columns="
-        of = (points or readings)[0].sheet.path
+        of = (points or imported_tables)[0].sheet.path
         raise DataError(f"{of}: holds {lacks if points else neither}")
     return turns[0]
 
 
 def save(path: Path | str, imported: Imported) -> None:
     """Write the contract's CSV."""
-    write_whole(path, imported.csv())
+    write_file_atomically(path, imported.csv())

@@ -4,24 +4,30 @@ Result files are read and checked (`sources`), said in words, tables and figures
 put on a page (`page`); `pdf` prints it.
 """
 
-from minimax_cal.reporting.html.content import Figure, Note, Report, Section, View
-from minimax_cal.reporting.html.document import Wording, compose
-from minimax_cal.reporting.html.page import render
-from minimax_cal.reporting.html.pdf import find_browser, picture, print_pdf
-from minimax_cal.reporting.html.sources import Sources, read_sources
+from minimax_cal.reporting.html.browser_print import find_browser, write_first_page_png, write_pdf
+from minimax_cal.reporting.html.html_page import render_html
+from minimax_cal.reporting.html.report_builder import ReportRequest, build_report
+from minimax_cal.reporting.html.report_content import (
+    ChartBlock,
+    NoteBlock,
+    ReportDocument,
+    ReportSection,
+    View3dBlock,
+)
+from minimax_cal.reporting.html.report_sources import ReportSources, read_report_sources
 
 __all__ = [
-    "Figure",
-    "Note",
-    "Report",
-    "Section",
-    "Sources",
-    "View",
-    "Wording",
-    "compose",
+    "ChartBlock",
+    "NoteBlock",
+    "ReportDocument",
+    "ReportRequest",
+    "ReportSection",
+    "ReportSources",
+    "View3dBlock",
+    "build_report",
     "find_browser",
-    "picture",
-    "print_pdf",
-    "read_sources",
-    "render",
+    "read_report_sources",
+    "render_html",
+    "write_first_page_png",
+    "write_pdf",
 ]

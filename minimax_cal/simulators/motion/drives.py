@@ -12,251 +12,307 @@ from typing import Any
 import numpy as np
 from scipy.linalg import block_diag
 
+from minimax_cal.core.arrays import Array
+from minimax_cal.core.errors import OptionError, RobotError
+from minimax_cal.core.files import format_json, to_plain_json, write_file_atomically
 from minimax_cal.dynamics.drives import (
-    DELAY,
-    FIELDS,
-    FITTED,
-    FRICTION,
-    GAINS,
-    IN_A_RUN,
-    INERTIA,
-    KINDS,
-    SPEED_LIMIT,
-    Body,
-    Drive,
+    COMMAND_DELAY_EFFECT,
+    COULOMB_FRICTION,
+    DRIVE_EFFECT_UNITS,
+    DRIVE_EFFECTS,
+    FITTED_DRIVE_FIELDS,
+    MAX_STRETCHES_PER_RUN,
+    ROTOR_INERTIA,
+    SERVO_GAIN_EFFECT,
+    SPEED_LIMIT_EFFECT,
+    BodyTorqueFunction,
+    CommandedRuns,
     DriveFit,
-    Followed,
-    covariance_of,
+    PositionDrive,
     fit_drive,
-    is_another,
+    is_drive_effect_confirmed,
+    jackknife_covariance,
 )
-from minimax_cal.dynamics.laws import WORDS, Element
-from minimax_cal.dynamics.logs.table import NOTHING
-from minimax_cal.dynamics.regressor import Motion
-from minimax_cal.dynamics.result import MotionEffect, changed_joints
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import OptionError, RobotError
-from minimax_cal.ground.files import json_text, plain, write_whole
-from minimax_cal.measuring.faults.fault import Amount
-from minimax_cal.robots.document import Document
-from minimax_cal.robots.mjcf import numbers
-from minimax_cal.simulators.chain import IMPLICIT_INTEGRATORS, Chain
+from minimax_cal.dynamics.laws import TORQUE_EFFECT_WORDS, SimulatorElement
+from minimax_cal.dynamics.logs.log_table import NO_TORQUE_UNIT
+from minimax_cal.dynamics.regressor import JointMotion
+from minimax_cal.dynamics.result import MotionEffect, pair_changed_rms_by_joint
+from minimax_cal.measuring.faults.data_fault import FaultAmount
+from minimax_cal.robots.mjcf_import import format_exact_numbers
+from minimax_cal.robots.xml_document import XmlDocument
+from minimax_cal.simulators.chain import IMPLICIT_INTEGRATORS, ModelArm
 from minimax_cal.simulators.elements import set_servo_gains
 from minimax_cal.simulators.mjcf_tree import MjcfTree, set_element
-from minimax_cal.simulators.motion.correct import HISTORY_FIRST, Candidate, Corrected, mean_log
-from minimax_cal.simulators.motion.fit import Study, fit_numbers
-from minimax_cal.simulators.motion.judge import OWN_SERVOS, Judge
-from minimax_cal.simulators.motion.numbers import (
+from minimax_cal.simulators.motion.correct import (
+    HISTORY_NOTICE,
+    CandidateModel,
+    CorrectedMotionModel,
+    mean_logarithm,
+)
+from minimax_cal.simulators.motion.fit import FitData, fit_model_parameters
+from minimax_cal.simulators.motion.judge import OWN_SERVOS_TEXT, MotionJudge
+from minimax_cal.simulators.motion.model_parameters import (
     MIN_DELAY_TIMESTEPS,
-    Bodies,
-    Numbers,
-    Opened,
+    ModelBodies,
+    ModelParameters,
+    OpenedModel,
     delay_attributes,
-    given_numbers,
-    write_numbers,
+    read_model_parameters,
+    write_model_parameters,
 )
 from minimax_cal.simulators.result import WrittenElement
 
-WORTH = 0.01  # fall of the mean log joint error by which an effect of a drive is kept
-OTHER_SHARE = 0.4  # fall of what is left, as a mean log, by which drives carry gravity otherwise
-NO_DAMPER = 0.25  # of a joint's damping: a drive with less has none
-SHAKES = 0.5  # of the inertia, damper times timestep: more is too much for an explicit step
-Pair = tuple[Followed, Followed]
-Told = tuple[str, int]  # an effect, and at which joint
-ALL: Told = (GAINS, -1)  # the share of gravity that all drives carry
+MIN_LOG_JOINT_ERROR_FALL = (
+    0.01  # fall of the mean log joint error by which an effect of a drive is kept
+)
+MIN_LOG_TORQUE_FALL_FOR_GRAVITY_SHARE = (
+    0.4  # fall of what is left, as a mean log, by which drives carry gravity otherwise
+)
+MAX_DAMPER_SHARE_OF_NONE = 0.25  # of a joint's damping: a drive with less has none
+MAX_EXPLICIT_DAMPING = (
+    0.5  # of the inertia, damper times timestep: more is too much for an explicit step
+)
+LearningAndHeldOut = tuple[CommandedRuns, CommandedRuns]
+JointEffect = tuple[str, int]  # an effect, and at which joint
+GRAVITY_SHARE_EFFECT: JointEffect = (
+    SERVO_GAIN_EFFECT,
+    -1,
+)  # the share of gravity that all drives carry
 
 
 @dataclass(frozen=True, eq=False)
-class Served:
+class FittedDrives:
     """Drives as the model has them, and as logs show them.
 
-    given: (n) of the model.  fits: (n), None where the logs tell nothing.  told: effects that are
-    another than the model's.  share: of gravity that drives carry, of the model and of the arm.
-    damping: (n,) of the joints, that is part of the fitted dampers where no torque tells them
-    apart.
+    model_drives: (n) of the model.  fits: (n), None where the logs tell nothing.  changed_effects:
+    effects that are another than the model's.  gravity_shares: of gravity that drives carry, of the
+    model and of the arm. joint_damping: (n,) of the joints, that is part of the fitted dampers
+    where no torque tells them apart.
     """
 
-    given: tuple[Drive, ...]
+    model_drives: tuple[PositionDrive, ...]
     fits: tuple[DriveFit | None, ...]
-    told: tuple[Told, ...]
-    share: tuple[float, float]
-    damping: Array
+    changed_effects: tuple[JointEffect, ...]
+    gravity_shares: tuple[float, float]
+    joint_damping: Array
 
-    def drives(self, kinds: Sequence[str] = KINDS) -> tuple[Drive, ...]:
+    def select_drives(self, kinds: Sequence[str] = DRIVE_EFFECTS) -> tuple[PositionDrive, ...]:
         """(n) the model's with what is told of some kinds."""
-        out = list(self.given)
-        for kind, j in self.told:
+        out = list(self.model_drives)
+        for kind, j in self.changed_effects:
             if kind in kinds and (fit := self.fits[j]):
-                servo = max(fit.drive.damper - float(self.damping[j]), 0.0)
-                out[j] = out[j].taking(replace(fit.drive, damper=servo), kind)
+                servo = max(fit.drive.damper - float(self.joint_damping[j]), 0.0)
+                out[j] = out[j].with_effect_of(replace(fit.drive, damper=servo), kind)
         return tuple(out)
 
-    def without(self, one: Told) -> Served:
+    def without_effect(self, one: JointEffect) -> FittedDrives:
         """With the model's own numbers of one effect."""
-        if one == ALL:
-            return replace(self, share=(self.share[0], self.share[0]))
-        return replace(self, told=tuple(each for each in self.told if each != one))
+        if one == GRAVITY_SHARE_EFFECT:
+            return replace(self, gravity_shares=(self.gravity_shares[0], self.gravity_shares[0]))
+        return replace(
+            self, changed_effects=tuple(each for each in self.changed_effects if each != one)
+        )
 
     @property
-    def changes(self) -> bool:
+    def has_changes(self) -> bool:
         """Whether anything is another than in the model."""
-        return bool(self.told) or self.share[0] != self.share[1]
+        return bool(self.changed_effects) or self.gravity_shares[0] != self.gravity_shares[1]
 
-    def apply_to(self, opened: Opened, kinds: Sequence[str] = KINDS) -> Opened:
+    def apply_to(self, opened: OpenedModel, kinds: Sequence[str] = DRIVE_EFFECTS) -> OpenedModel:
         """The model with what is told of its drives, of some kinds."""
         document = opened.given.document.copy()
-        write_drives(document, opened.chain, self.drives(kinds), self.share[1])
-        return opened.again(document)
+        write_drives(document, opened.chain, self.select_drives(kinds), self.gravity_shares[1])
+        return opened.with_document(document)
 
-    def joint_error(self, judge: Judge, opened: Opened) -> float:
+    def measure_joint_error(self, judge: MotionJudge, opened: OpenedModel) -> float:
         """Mean log joint error on the runs held out; infinite where the model is unstable."""
         try:
-            return mean_log(judge.tracking(self.apply_to(opened).chain))
+            return mean_logarithm(judge.measure_joint_error(self.apply_to(opened).chain))
         except RobotError:
             return math.inf
 
-    def without_idle(self, judge: Judge, opened: Opened) -> Served:
+    def without_idle(self, judge: MotionJudge, opened: OpenedModel) -> FittedDrives:
         """Without effects whose lack does not raise the joint error of the driven model.
 
         opened: the model with all that logs show beside.
         """
-        served, best = self, self.joint_error(judge, opened)
-        for one in (*reversed(self.told), ALL):
-            less = served.without(one)
-            if one[0] == SPEED_LIMIT or (one == ALL and less.share == served.share):
+        served, best = self, self.measure_joint_error(judge, opened)
+        for one in (*reversed(self.changed_effects), GRAVITY_SHARE_EFFECT):
+            less = served.without_effect(one)
+            if one[0] == SPEED_LIMIT_EFFECT or (
+                one == GRAVITY_SHARE_EFFECT and less.gravity_shares == served.gravity_shares
+            ):
                 continue
-            error = less.joint_error(judge, opened)
-            if error < best + WORTH:
+            error = less.measure_joint_error(judge, opened)
+            if error < best + MIN_LOG_JOINT_ERROR_FALL:
                 served, best = less, error
         return served
 
-    def rate_effects(self, judge: Judge, opened: Opened) -> tuple[MotionEffect, ...]:
+    def rate_effects(self, judge: MotionJudge, opened: OpenedModel) -> tuple[MotionEffect, ...]:
         """What is told, each with the joint errors [mrad] of the model without and with it."""
-        whole, effects = judge.tracking(self.apply_to(opened).chain), []
-        shared = [ALL] if self.share[0] != self.share[1] else []
-        for kind, j in (*shared, *self.told):
-            amounts: tuple[Amount, ...] = (Amount("gravity_share", self.share[1], "1"),)
+        whole, effects = judge.measure_joint_error(self.apply_to(opened).chain), []
+        shared = [GRAVITY_SHARE_EFFECT] if self.gravity_shares[0] != self.gravity_shares[1] else []
+        for kind, j in (*shared, *self.changed_effects):
+            amounts: tuple[FaultAmount, ...] = (
+                FaultAmount("gravity_share", self.gravity_shares[1], "1"),
+            )
             fit = self.fits[j]
             if fit and j >= 0:
-                amounts = tuple(Amount(name, getattr(fit.drive, name), unit, fit.sigma[name])
-                                for name, unit in FIELDS[kind].items())  # fmt: skip
+                amounts = tuple(
+                    FaultAmount(name, getattr(fit.drive, name), unit, fit.sigma_by_field[name])
+                    for name, unit in DRIVE_EFFECT_UNITS[kind].items()
+                )
             less = whole
-            if kind != SPEED_LIMIT:
-                less = judge.tracking(self.without((kind, j)).apply_to(opened).chain)
+            if kind != SPEED_LIMIT_EFFECT:
+                less = judge.measure_joint_error(
+                    self.without_effect((kind, j)).apply_to(opened).chain
+                )
             place = "all" if j < 0 else f"J{j + 1}"
-            worth = changed_joints(1e3 * less, 1e3 * whole)
+            worth = pair_changed_rms_by_joint(1e3 * less, 1e3 * whole)
             effects.append(MotionEffect(kind, place, amounts, worth))
         return tuple(effects)
 
     def apply_by_steps(
-        self, effects: Sequence[MotionEffect], opened: Opened
-    ) -> Iterator[tuple[str, Opened]]:
+        self, effects: Sequence[MotionEffect], opened: OpenedModel
+    ) -> Iterator[tuple[str, OpenedModel]]:
         """The model with the drives, a step for each kind of effect, and what it is called."""
-        for number, kind in enumerate(KINDS):
+        for number, kind in enumerate(DRIVE_EFFECTS):
             if kind in {effect.effect for effect in effects}:
-                yield f"+ {WORDS[kind]}", self.apply_to(opened, KINDS[: number + 1])
+                yield (
+                    f"+ {TORQUE_EFFECT_WORDS[kind]}",
+                    self.apply_to(opened, DRIVE_EFFECTS[: number + 1]),
+                )
 
 
-def own_drives(chain: Chain) -> tuple[Drive, ...]:
+def read_model_drives(chain: ModelArm) -> tuple[PositionDrive, ...]:
     """(n) the position servos of a model."""
     model, out = chain.model, []
-    late = getattr(model, "actuator_delay", np.zeros(model.nu))[chain.servos].tolist()
+    late = getattr(model, "actuator_delay", np.zeros(model.nu))[chain.servo_ids].tolist()
     servos, forward = chain.read_servos(), chain.find_feed_forward()
-    for j in range(len(chain.joints)):
+    for j in range(len(chain.joint_ids)):
         ahead = sum(float(model.actuator_gainprm[k, 0]) for k, i in forward.items() if i == j)
         whole = float(servos.damper[j]) + ahead
-        out.append(Drive(float(servos.gain[j]), whole, ahead / whole if ahead else 0.0, late[j],
-                         float(np.abs(servos.limits[j]).min())))  # fmt: skip
+        out.append(
+            PositionDrive(
+                float(servos.gain[j]),
+                whole,
+                ahead / whole if ahead else 0.0,
+                late[j],
+                float(np.abs(servos.limits[j]).min()),
+            )
+        )
     return tuple(out)
 
 
-def share_of(chain: Chain) -> float:
+def read_gravity_share(chain: ModelArm) -> float:
     """Of gravity, that the actuators of a model carry."""
-    return float(np.mean(chain.model.body_gravcomp[list(chain.bodies)]))
+    return float(np.mean(chain.model.body_gravcomp[list(chain.body_ids)]))
 
 
 @dataclass(frozen=True, eq=False)
-class Fits:
+class DriveFits:
     """Fits (n,) of drives that carry a share of gravity, None where the logs tell nothing.
 
-    held: runs held out.  left: mean log of the torque that is left of these, all without a fit.
+    held_out_runs: runs held out.  mean_log_torque_left: mean log of the torque that is left of
+    these, all without a fit.
     """
 
-    share: float
-    each: tuple[DriveFit | None, ...]
-    held: Followed
-    left: float
+    gravity_share: float
+    fits: tuple[DriveFit | None, ...]
+    held_out_runs: CommandedRuns
+    mean_log_torque_left: float
 
     @staticmethod
-    def of(seen: Pair, given: Sequence[Drive], share: float, body: Body) -> Fits:
+    def fit_all(
+        seen: LearningAndHeldOut,
+        given: Sequence[PositionDrive],
+        share: float,
+        body: BodyTorqueFunction,
+    ) -> DriveFits:
         """By the runs to learn from.  seen: these, and those held out."""
-        learnt, held = (one.carrying(share, body) for one in seen)
+        learnt, held = (one.with_gravity_share(share, body) for one in seen)
         left = list[float]()
         each = tuple(fit_drive(learnt, held, j, drive) for j, drive in enumerate(given))
         for j, fit in enumerate(each):
-            rows = held.joint(j)
-            rest = fit.rest(rows) if fit else rows.torque
+            rows = held.build_joint_rows(j)
+            rest = fit.compute_residuals(rows) if fit else rows.torque
             left.append(float((rest**2).sum()))
-        return Fits(share, each, held, 0.5 * mean_log(np.array(left)))
+        return DriveFits(share, each, held, 0.5 * mean_logarithm(np.array(left)))
 
-    def beaten_by(self, other: Fits) -> bool:
+    def is_beaten_by(self, other: DriveFits) -> bool:
         """Whether another share leaves far less, and tells of as many drives."""
-        known, more = (sum(fit is not None for fit in one.each) for one in (self, other))
-        return more >= max(known, 1) and other.left < self.left - OTHER_SHARE
+        known, more = (sum(fit is not None for fit in one.fits) for one in (self, other))
+        return (
+            more >= max(known, 1)
+            and other.mean_log_torque_left
+            < self.mean_log_torque_left - MIN_LOG_TORQUE_FALL_FOR_GRAVITY_SHARE
+        )
 
 
-def serve(judge: Judge, opened: Opened, *, plain: bool = False) -> Served:
+def fit_drives(judge: MotionJudge, opened: OpenedModel, *, portable: bool = False) -> FittedDrives:
     """What logs with commands say of a model's drives.
 
-    plain: without delays, which other simulators do not read.
+    portable: without delays, which other simulators do not read.
     """
-    chain, least = opened.chain, MIN_DELAY_TIMESTEPS * opened.chain.step
-    own, damping, first = own_drives(chain), np.zeros(len(chain.dofs)), share_of(chain)
-    if judge.held.unit == NOTHING:
-        damping = chain.model.dof_damping[chain.dofs]
+    chain, least = opened.chain, MIN_DELAY_TIMESTEPS * opened.chain.timestep
+    own, damping, first = (
+        read_model_drives(chain),
+        np.zeros(len(chain.dof_indices)),
+        read_gravity_share(chain),
+    )
+    if judge.held_out_logs.unit == NO_TORQUE_UNIT:
+        damping = chain.model.dof_damping[chain.dof_indices]
     given = [replace(one, damper=one.damper + by) for one, by in zip(own, damping, strict=True)]
-    body = body_of(chain)
-    seen = followed(judge, body)
-    best = Fits.of(seen, given, first, body)
+    body = body_torque_function(chain)
+    seen = read_followed_runs(judge, body)
+    best = DriveFits.fit_all(seen, given, first, body)
     for other in {0.0, 1.0} - {first}:
-        tried = Fits.of(seen, given, other, body)
-        best = tried if best.beaten_by(tried) else best
-    late = hasattr(chain.model, "actuator_delay") and not plain
-    kinds = [one for one in KINDS if one != DELAY or late]
-    told = tuple((kind, j) for kind in kinds for j, fit in enumerate(best.each)
-                 if fit and is_another(kind, fit, given[j], best.held, j, least))  # fmt: skip
-    return Served(own, best.each, told, (first, best.share), damping)
+        tried = DriveFits.fit_all(seen, given, other, body)
+        best = tried if best.is_beaten_by(tried) else best
+    late = hasattr(chain.model, "actuator_delay") and not portable
+    kinds = [one for one in DRIVE_EFFECTS if one != COMMAND_DELAY_EFFECT or late]
+    told = tuple(
+        (kind, j)
+        for kind in kinds
+        for j, fit in enumerate(best.fits)
+        if fit and is_drive_effect_confirmed(kind, fit, given[j], best.held_out_runs, j, least)
+    )
+    return FittedDrives(own, best.fits, told, (first, best.gravity_share), damping)
 
 
-def followed(judge: Judge, body: Body) -> Pair:
+def read_followed_runs(judge: MotionJudge, body_torque: BodyTorqueFunction) -> LearningAndHeldOut:
     """The runs to learn from, and those held out, with their commands."""
     arm = judge.arm
-    return Followed.of(judge.learning_runs, arm, body), Followed.of(judge.runs, arm, body)
+    return CommandedRuns.build(judge.learning_runs, arm, body_torque), CommandedRuns.build(
+        judge.held_out_runs, arm, body_torque
+    )
 
 
-def damped_by_joints(judge: Judge, opened: Opened) -> bool:
+def are_logs_without_joint_dampers(judge: MotionJudge, opened: OpenedModel) -> bool:
     """Whether logged torques lack the dampers that joints of a file hold for its servos.
 
     So they do where the same file, simulated, made the log.
     """
     chain = opened.chain
-    damping, held = chain.model.dof_damping[chain.dofs], chain.has_servo_dampers()
+    damping, held = chain.model.dof_damping[chain.dof_indices], chain.has_servo_dampers()
     if not held.all():
         return False
-    body = body_of(chain)
-    fits = Fits.of(followed(judge, body), own_drives(chain), share_of(chain), body).each
+    body = body_torque_function(chain)
+    fits = DriveFits.fit_all(
+        read_followed_runs(judge, body), read_model_drives(chain), read_gravity_share(chain), body
+    ).fits
     parts = [fit.drive.damper / damping[j] for j, fit in enumerate(fits) if fit]
-    return bool(parts) and np.median(parts) < NO_DAMPER
+    return bool(parts) and np.median(parts) < MAX_DAMPER_SHARE_OF_NONE
 
 
-def body_of(chain: Chain) -> Body:
+def body_torque_function(chain: ModelArm) -> BodyTorqueFunction:
     """Torque that the masses of a model alone take for a motion, whatever carries them."""
-    mj, model, data, at, dofs = replace(chain, model=copy(chain.model)).fresh()
+    mj, model, data, at, dofs = replace(chain, model=copy(chain.model)).new_data()
     model.opt.disableflags |= int(mj.mjtDisableBit.mjDSBL_CONSTRAINT)
     for name in ("dof_armature", "dof_damping", "jnt_stiffness", "body_gravcomp"):
         getattr(model, name)[:] = 0.0
 
-    def body(motion: Motion) -> Array:
+    def body(motion: JointMotion) -> Array:
         out = np.empty(motion.q.shape)
         for k, row in enumerate(zip(motion.q, motion.qd, motion.qdd, strict=True)):
             data.qpos[at], data.qvel[dofs], data.qacc[dofs] = row
@@ -267,27 +323,27 @@ def body_of(chain: Chain) -> Body:
     return body
 
 
-def lost_late(effects: Sequence[MotionEffect]) -> Iterator[str]:
+def list_delay_notices(effects: Sequence[MotionEffect]) -> Iterator[str]:
     """What is to be said where a file has late commands, for people."""
-    if any(one.effect == DELAY for one in effects):
-        yield Element.DELAY.left_out
-        yield HISTORY_FIRST
+    if any(one.effect == COMMAND_DELAY_EFFECT for one in effects):
+        yield SimulatorElement.DELAY.describe_omission
+        yield HISTORY_NOTICE
 
 
 def write_drives(
-    document: Document, chain: Chain, drives: Sequence[Drive], gravity_share: float
+    document: XmlDocument, chain: ModelArm, drives: Sequence[PositionDrive], gravity_share: float
 ) -> None:
     """Give the servos of a model the numbers of drives, where these are others than it has.
 
     gravity_share: of gravity, that the actuators carry.
     """
-    tree, model, step = MjcfTree(document.root), chain.model, chain.step
-    floating, joints = bool(model.body_gravcomp[chain.bodies[0]]), tree.find_joints(chain)
-    for j, (drive, own) in enumerate(zip(drives, own_drives(chain), strict=True)):
+    tree, model, step = MjcfTree(document.root), chain.model, chain.timestep
+    floating, joints = bool(model.body_gravcomp[chain.body_ids[0]]), tree.find_joints(chain)
+    for j, (drive, own) in enumerate(zip(drives, read_model_drives(chain), strict=True)):
         # Gains at the motor; a velocity actuator takes the commanded speed.
-        name, gear = chain.names[j], model.actuator_gear[chain.servos[j], 0]
+        name, gear = chain.joint_names[j], model.actuator_gear[chain.servo_ids[j], 0]
         servo = next(e for e in tree.find_actuators(name) if e.tag in ("position", "general"))
-        has_other_gains = drive.taking(own, GAINS) != drive
+        has_other_gains = drive.with_effect_of(own, SERVO_GAIN_EFFECT) != drive
         if has_other_gains:
             damper = (1.0 - drive.ahead) * drive.damper
             set_servo_gains(servo, drive.stiffness / gear**2, damper / gear**2)
@@ -304,7 +360,7 @@ def write_drives(
             element.set(f"{what}limited", "true" if is_limited else "false")
             if is_limited:
                 limit = drive.torque / (1.0 if floating else abs(gear))
-                element.set(f"{what}range", numbers([-limit, limit]))
+                element.set(f"{what}range", format_exact_numbers([-limit, limit]))
 
         # Delay of the command, of all actuators of the joint.
         if has_other_gains or drive.delay != own.delay:
@@ -312,12 +368,12 @@ def write_drives(
                 for attribute in ("delay", "nsample", "interp"):
                     actuator.attrib.pop(attribute, None)
                 actuator.attrib |= delay_attributes(drive.delay, step)
-    damping = np.array([d.damper for d in drives]) * step * model.dof_invweight0[chain.dofs]
-    if model.opt.integrator not in IMPLICIT_INTEGRATORS and damping.max() > SHAKES:
+    damping = np.array([d.damper for d in drives]) * step * model.dof_invweight0[chain.dof_indices]
+    if model.opt.integrator not in IMPLICIT_INTEGRATORS and damping.max() > MAX_EXPLICIT_DAMPING:
         tree.section("option").set("integrator", "implicitfast")
-    if gravity_share != share_of(chain):
+    if gravity_share != read_gravity_share(chain):
         for body in tree.find_parents()[joints[0]].iter("body"):
-            body.set("gravcomp", numbers([gravity_share]))
+            body.set("gravcomp", format_exact_numbers([gravity_share]))
         for joint in joints:
             joint.set("actuatorgravcomp", "true" if gravity_share else "false")
 
@@ -325,12 +381,14 @@ def write_drives(
 # ---- actuators and ranges ------------------------------------------------------------------------
 
 
-UNITS = {name: unit for fields in FIELDS.values() for name, unit in fields.items()}
-ELEMENTS = {  # of the body, their names and units, and how they stand in `Numbers`
-    Element.FRICTION: (("friction", "N m"), ("damping", "N m s/rad")),
-    Element.ARMATURE: (("armature", "kg m^2"),),
+DRIVE_FIELD_UNITS = {
+    name: unit for fields in DRIVE_EFFECT_UNITS.values() for name, unit in fields.items()
 }
-ISAAC = '''"""Actuators of {name} for Isaac Lab, whose physics steps are of {step} s.
+RANGED_ELEMENTS = {  # of the body, their names and units, and how they stand in `ModelParameters`
+    SimulatorElement.FRICTION: (("friction", "N m"), ("damping", "N m s/rad")),
+    SimulatorElement.ARMATURE: (("armature", "kg m^2"),),
+}
+ISAAC_TEMPLATE = '''"""Actuators of {name} for Isaac Lab, whose physics steps are of {step} s.
 
 A drive whose feed_forward is s wants s times the commanded speed as its velocity target.
 feed_forward = {ahead}
@@ -343,27 +401,39 @@ ACTUATORS = {{
 '''
 
 
-def write_actuators(path: Path | str, form: str, chain: Chain, served: Served | None) -> None:
+def write_actuators(
+    path: Path | str, file_format: str, chain: ModelArm, fitted_drives: FittedDrives | None
+) -> None:
     """Write the actuators of a model as it is written, in SI, in a format that simulators take.
 
-    form: json or isaac.  served: what its logs say of speeds that no model holds.
+    file_format: json or isaac.  fitted_drives: what its logs say of speeds that no model holds.
     """
-    dofs, step, name = chain.dofs, chain.step, chain.robot.name
-    fits = served.fits if served else (None,) * len(dofs)
+    dofs, step, name = chain.dof_indices, chain.timestep, chain.robot.name
+    fits = fitted_drives.fits if fitted_drives else (None,) * len(dofs)
     held = ("dof_armature", "dof_frictionloss", "dof_damping")
     body = np.array([getattr(chain.model, field)[dofs] for field in held]).T.tolist()
     joints: list[dict[str, Any]] = [
-        {"joint": joint, "stiffness": drive.stiffness, "damping": drive.damper,
-         "feed_forward": drive.ahead, "armature": own[0], "friction": own[1],
-         "viscous_friction": own[2], "effort_limit": drive.torque,
-         "velocity_limit": fit.drive.speed if fit else math.inf, "delay": drive.delay,
-         "delay_steps": round(drive.delay / step)}
-        for joint, drive, own, fit in zip(chain.names, own_drives(chain), body, fits, strict=True)
-    ]  # fmt: skip
-    if form == "json":
+        {
+            "joint": joint,
+            "stiffness": drive.stiffness,
+            "damping": drive.damper,
+            "feed_forward": drive.ahead,
+            "armature": own[0],
+            "friction": own[1],
+            "viscous_friction": own[2],
+            "effort_limit": drive.torque,
+            "velocity_limit": fit.drive.speed if fit else math.inf,
+            "delay": drive.delay,
+            "delay_steps": round(drive.delay / step),
+        }
+        for joint, drive, own, fit in zip(
+            chain.joint_names, read_model_drives(chain), body, fits, strict=True
+        )
+    ]
+    if file_format == "json":
         content = {"schema": 1, "kind": "actuators", "model": name, "timestep": step,
                    "joints": joints}  # fmt: skip
-        write_whole(Path(path), json_text(plain(content)))
+        write_file_atomically(Path(path), format_json(to_plain_json(content)))
         return
 
     # Isaac Lab has a group of actuators for each delay, and no infinite limits.
@@ -379,100 +449,122 @@ def write_actuators(path: Path | str, form: str, chain: Chain, served: Served | 
         entries += "".join(f"        {key}={value!r},\n" for key, value in fields.items())
         entries += "    ),\n"
     ahead = {one["joint"]: one["feed_forward"] for one in joints}
-    write_whole(Path(path), ISAAC.format(name=name, step=step, ahead=ahead, entries=entries))
+    write_file_atomically(
+        Path(path), ISAAC_TEMPLATE.format(name=name, step=step, ahead=ahead, entries=entries)
+    )
 
 
 # ---- ranges ------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
-class Ranged:
+class ParameterRanges:
     """Numbers of a kind, with their covariance (p, p) and their spread between runs (p,)."""
 
     names: tuple[tuple[str, str, str], ...]
     mean: Array
     covariance: Array
-    between: Array
+    spread_between_runs: Array
 
 
-def of_drives(served: Served, joints: tuple[str, ...], count: int) -> Ranged:
-    """Gains and delays, by stretches of the runs left out in turn.  count: of the runs."""
-    told = [(fit, k, (name, joint, UNITS[name]), getattr(drive, name))
-            for joint, fit, drive in zip(joints, served.fits, served.drives(), strict=True) if fit
-            for k, name in enumerate(FITTED) if (fit.change[:, k] != 0.0).any()]  # fmt: skip
-    every = sorted({stretch for fit, *_ in told for stretch in fit.stretch.tolist()})
-    changes = [dict(zip(fit.stretch.tolist(), fit.change[:, k], strict=True))
+def estimate_drive_ranges(
+    served: FittedDrives, joints: tuple[str, ...], run_count: int
+) -> ParameterRanges:
+    """Gains and delays, by stretches of the runs left out in turn.  run_count: of the runs."""
+    told = [
+        (fit, k, (name, joint, DRIVE_FIELD_UNITS[name]), getattr(drive, name))
+        for joint, fit, drive in zip(joints, served.fits, served.select_drives(), strict=True)
+        if fit
+        for k, name in enumerate(FITTED_DRIVE_FIELDS)
+        if (fit.jackknife_changes[:, k] != 0.0).any()
+    ]
+    every = sorted({stretch for fit, *_ in told for stretch in fit.stretch_numbers.tolist()})
+    changes = [dict(zip(fit.stretch_numbers.tolist(), fit.jackknife_changes[:, k], strict=True))
                for fit, k, *_ in told]  # fmt: skip
     change = np.array([[one.get(stretch, 0.0) for one in changes] for stretch in every])
     change = change.reshape(len(every), len(changes))
-    run = np.array(every, dtype=int) // IN_A_RUN
-    by_run = np.array([change[run == number].sum(axis=0) for number in range(count)])
-    covariance = covariance_of(change) if every else np.zeros((0, 0))
+    run = np.array(every, dtype=int) // MAX_STRETCHES_PER_RUN
+    by_run = np.array([change[run == number].sum(axis=0) for number in range(run_count)])
+    covariance = jackknife_covariance(change) if every else np.zeros((0, 0))
     names, mean = tuple(name for *_, name, _ in told), np.array([one[-1] for one in told])
-    return Ranged(names, mean, covariance, spread(by_run))
+    return ParameterRanges(names, mean, covariance, jackknife_spread(by_run))
 
 
-def spread(change: Array) -> Array:
+def jackknife_spread(leave_one_out_changes: Array) -> Array:
     """(p,) between runs, of the changes (r, p) without each; NaN of a single run."""
-    if len(change) < 2:
-        return np.full(change.shape[1:], np.nan)
-    return np.asarray((len(change) - 1.0) * np.std(change, axis=0, ddof=1))
+    if len(leave_one_out_changes) < 2:
+        return np.full(leave_one_out_changes.shape[1:], np.nan)
+    return np.asarray(
+        (len(leave_one_out_changes) - 1.0) * np.std(leave_one_out_changes, axis=0, ddof=1)
+    )
 
 
-def of_body(made: Candidate, study: Study, joints: tuple[str, ...]) -> Ranged:
+def estimate_body_ranges(
+    candidate: CandidateModel, fit_data: FitData, joint_names: tuple[str, ...]
+) -> ParameterRanges:
     """Friction, damping and armature that were fitted, each run left out in turn."""
-    kinds = [one for one in ELEMENTS if one in made.asked.elements]
-    names = tuple((name, joint, unit) for kind in kinds for name, unit in ELEMENTS[kind]
-                  for joint in joints)  # fmt: skip
+    kinds = [one for one in RANGED_ELEMENTS if one in candidate.selection.elements]
+    names = tuple((name, joint, unit) for kind in kinds for name, unit in RANGED_ELEMENTS[kind]
+                  for joint in joint_names)  # fmt: skip
 
-    def values(numbers: Numbers) -> Array:
-        each = (getattr(numbers, name) for kind in kinds for name, _ in ELEMENTS[kind])
-        return np.concatenate([[], *(one.reshape(len(joints), -1)[:, 0] for one in each)])
+    def values(numbers: ModelParameters) -> Array:
+        each = (getattr(numbers, name) for kind in kinds for name, _ in RANGED_ELEMENTS[kind])
+        return np.concatenate([[], *(one.reshape(len(joint_names), -1)[:, 0] for one in each)])
 
-    mean, runs = values(made.numbers), range(len(study.scene.logs.names))
+    mean, runs = values(candidate.parameters), range(len(fit_data.scene.logs.names))
     if len(runs) < 2 or not names:
         unknown = np.full(len(names), np.nan)
-        return Ranged(names, mean, np.diag(unknown), unknown)
-    studies = (study.only([run for run in runs if run != out]) for out in runs)
-    change = np.array([values(fit_numbers(one, made.asked)) - mean for one in studies])
+        return ParameterRanges(names, mean, np.diag(unknown), unknown)
+    studies = (fit_data.select_runs([run for run in runs if run != out]) for out in runs)
+    change = np.array(
+        [values(fit_model_parameters(one, candidate.selection)) - mean for one in studies]
+    )
     whole = (len(runs) - 1.0) / len(runs) * change.T @ change
-    return Ranged(names, mean, whole, spread(change))
+    return ParameterRanges(names, mean, whole, jackknife_spread(change))
 
 
 def write_ranges(
     path: Path | str,
-    fitted: tuple[Candidate, Study] | None,
-    served: Served | None,
-    joints: tuple[str, ...],
-    count: int,
+    fitted: tuple[CandidateModel, FitData] | None,
+    fitted_drives: FittedDrives | None,
+    joint_names: tuple[str, ...],
+    run_count: int,
 ) -> None:
     """Write mean, deviation and spread of what was fitted, and the covariance of all of it.
 
-    fitted: numbers of the body and the logs that told them.  count: of the runs to learn from.
+    fitted: numbers of the body and the logs that told them.  run_count: of the runs to learn from.
     """
-    parts = [of_drives(served, joints, count)] if served else []
-    parts += [of_body(*fitted, joints)] if fitted else []
+    parts = [estimate_drive_ranges(fitted_drives, joint_names, run_count)] if fitted_drives else []
+    parts += [estimate_body_ranges(*fitted, joint_names)] if fitted else []
     whole = block_diag(*(part.covariance for part in parts))
     sigma = iter(np.sqrt(np.diag(whole)).tolist())
     parameters = [
-        {"name": name, "joint": joint, "mean": mean, "sigma": next(sigma),
-         "between_runs": float(between), "unit": unit}
+        {
+            "name": name,
+            "joint": joint,
+            "mean": mean,
+            "sigma": next(sigma),
+            "between_runs": float(between),
+            "unit": unit,
+        }
         for part in parts
-        for (name, joint, unit), mean, between in zip(part.names, part.mean, part.between,
-                                                      strict=True)
-    ]  # fmt: skip
+        for (name, joint, unit), mean, between in zip(
+            part.names, part.mean, part.spread_between_runs, strict=True
+        )
+    ]
     content = {"schema": 1, "kind": "ranges", "parameters": parameters, "covariance": whole}
-    write_whole(Path(path), json_text(plain(content)))
+    write_file_atomically(Path(path), format_json(to_plain_json(content)))
 
 
 # ---- by commands and positions alone -------------------------------------------------------------
 
 
-HELD = {  # of the body, by their fields of `Numbers`: what was fitted beside drives, attributes
-    Element.FRICTION: (FRICTION, "frictionloss"),
-    Element.ARMATURE: (INERTIA, "armature"),
+# of the body, by their fields of `ModelParameters`: what was fitted beside drives, attributes
+BODY_ELEMENT_FIELDS = {
+    SimulatorElement.FRICTION: (COULOMB_FRICTION, "frictionloss"),
+    SimulatorElement.ARMATURE: (ROTOR_INERTIA, "armature"),
 }
-SCALE = (
+MASS_SCALE_NOTICE = (
     "commands and positions without torques: gains, friction and rotors are those for the masses "
     "of the model; were all masses k times as large, so would these be, and no position would "
     "change; a torque, or a weighed arm, tells k; dampers of servo and joint stand as one"
@@ -480,14 +572,16 @@ SCALE = (
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Answer(Corrected):
+class CorrectedDrivesModel(CorrectedMotionModel):
     """A corrected model with its drives, and what each effect of these is worth."""
 
-    served: Served | None = None
+    served: FittedDrives | None = None
     effects: tuple[MotionEffect, ...] = ()
 
 
-def by_positions(judge: Judge, opened: Opened, *, plain: bool) -> Answer:
+def correct_by_positions(
+    judge: MotionJudge, opened: OpenedModel, *, portable: bool
+) -> CorrectedDrivesModel:
     """What lowers the joint error under the logged commands, each step of it.
 
     Raises OptionError without servos to correct.
@@ -498,37 +592,51 @@ def by_positions(judge: Judge, opened: Opened, *, plain: bool) -> Answer:
             "timeconst): positions alone do not correct them; leave the filter out of the model, "
             "or log torques or currents"
         )
-    if judge.drives != OWN_SERVOS or not opened.has_correctable_servos():
+    if judge.drive_text != OWN_SERVOS_TEXT or not opened.has_correctable_servos():
         raise OptionError(
-            f"{judge.runs[0].source}: no column of torque or current: then every run needs "
+            f"{judge.held_out_runs[0].source}: no column of "
+            f"torque or current: then every run needs "
             "commands of all joints (q1_cmd_rad, ...), and the model position servos"
         )
-    served, names = serve(judge, opened, plain=plain), tuple(HELD)
-    served = served.without_idle(judge, with_body(opened, served, names))
+    served, names = fit_drives(judge, opened, portable=portable), tuple(BODY_ELEMENT_FIELDS)
+    served = served.without_idle(judge, apply_body_elements(opened, served, names))
     for name in reversed(names):
         less = tuple(one for one in names if one != name)
-        bare, whole = (served.joint_error(judge, with_body(opened, served, some))
+        bare, whole = (served.measure_joint_error(judge, apply_body_elements(opened, served, some))
                        for some in (less, names))  # fmt: skip
-        names = less if bare < whole + WORTH else names
-    effects = served.rate_effects(judge, with_body(opened, served, names))
+        names = less if bare < whole + MIN_LOG_JOINT_ERROR_FALL else names
+    effects = served.rate_effects(judge, apply_body_elements(opened, served, names))
     steps = list(served.apply_by_steps(effects, opened))
     driven = served.apply_to(opened)
-    steps += [(f"+ {name}", with_body(driven, served, names[: number + 1]))
+    steps += [(f"+ {name}", apply_body_elements(driven, served, names[: number + 1]))
               for number, name in enumerate(names)]  # fmt: skip
-    rungs = tuple(judge.rung(name, one.chain) for name, one in steps)
-    elements = tuple(WrittenElement(name.value, HELD[name][1], {}) for name in names)
-    return Answer(with_body(driven, served, names), rungs, elements, None, (), (SCALE,),
-                  tuple(lost_late(effects)), served=served, effects=effects)  # fmt: skip
+    rungs = tuple(judge.measure_step(name, one.chain) for name, one in steps)
+    elements = tuple(WrittenElement(name.value, BODY_ELEMENT_FIELDS[name][1], {}) for name in names)
+    return CorrectedDrivesModel(
+        apply_body_elements(driven, served, names),
+        rungs,
+        elements,
+        None,
+        (),
+        (MASS_SCALE_NOTICE,),
+        tuple(list_delay_notices(effects)),
+        served=served,
+        effects=effects,
+    )
 
 
-def with_body(opened: Opened, served: Served, names: Sequence[Element]) -> Opened:
+def apply_body_elements(
+    opened: OpenedModel, fitted_drives: FittedDrives, elements: Sequence[SimulatorElement]
+) -> OpenedModel:
     """The model with friction and rotors that were fitted beside the drives."""
     document = opened.given.document.copy()
-    new = given = given_numbers(opened.chain, Bodies.of(opened.chain))
-    for name in names:
-        values = [old if fit is None else max(fit.beside[HELD[name][0]], 0.0)
-                  for fit, old in zip(served.fits, getattr(given, name), strict=True)]  # fmt: skip
+    new = given = read_model_parameters(opened.chain, ModelBodies.read(opened.chain))
+    for name in elements:
+        values = [
+            old if fit is None else max(fit.nuisance_values[BODY_ELEMENT_FIELDS[name][0]], 0.0)
+            for fit, old in zip(fitted_drives.fits, getattr(given, name), strict=True)
+        ]
         changes: dict[str, Any] = {name: np.array(values)}
         new = replace(new, **changes)
-    write_numbers(document, opened.chain, given, new)
-    return opened.again(document)
+    write_model_parameters(document, opened.chain, given, new)
+    return opened.with_document(document)
