@@ -89,7 +89,7 @@ class Table:
         return replace(self, rows=(*self.rows, *(tuple(map(to_table_cell, row)) for row in rows)))
 
     def shorten(self, *column_names: str, max_rows: int = MAX_FIRST_SCREEN_ROWS) -> Table:
-        """Some of the columns, all unless named, and at most so many max_rows: the first and the
+        """Some of the columns, all unless named, and at most so many rows: the first and the
         last.
 
         The title says how many rows are left out.

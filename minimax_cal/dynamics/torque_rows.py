@@ -350,7 +350,7 @@ def check_held_out_run_names(
 
 @dataclass(frozen=True, eq=False)
 class AutoregressiveWhitening:
-    """Which rows are fitted, and what makes their noise whiten_rows: rows of all joints, joint by
+    """Which rows are fitted, and what makes their noise white: rows of all joints, joint by
     joint.
 
     is_row_fitted: (n, R) rows that are fitted.  previous_row_counts: (N,) how many rows of the same

@@ -61,7 +61,7 @@ class SeparationQuestion:
 
 @dataclass(frozen=True, eq=False)
 class StudyWithGivenPoses(MeasurementPlanner):
-    """A site whose further poses are given_plan: `measured_rows` and `more`, no revisits."""
+    """A site whose further poses are given: `measured_rows` and `more`, no revisits."""
 
     given_plan: next_measurement.MeasurementPlan = field(kw_only=True)
 

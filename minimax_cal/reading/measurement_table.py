@@ -66,7 +66,7 @@ JOINT_OPTION_COLUMN_PATTERN = re.compile(r"(?:approach|tau|qread)(\d+)(?:_\w+)?"
 
 @dataclass(frozen=True, eq=False)
 class MeasurementTable:
-    """A table as text_column: header, rows, and the line on which each row ends.
+    """A table as text: header, rows, and the line on which each row ends.
 
     header: names as this project has them.  given: as the file has them.  block: the rows as
     numbers, where all cells are.

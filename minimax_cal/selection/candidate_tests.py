@@ -135,7 +135,7 @@ class ProjectedProducts:
 
 @dataclass(frozen=True, eq=False)
 class CandidateTests:
-    """Where candidates are fit_shape_group: beside what was chosen, over several ratios of the
+    """Where candidates are compared: beside what was chosen, over several ratios of the
     noises.
 
     tested_law_count: laws that are compared, for the chance of a false name.  degrees_of_freedom:

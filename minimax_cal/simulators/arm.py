@@ -76,7 +76,7 @@ TRACELESS_BASIS = np.linalg.svd(np.eye(3).reshape(1, 9))[2][1:].T  # (9, 8) matr
 
 @dataclass(frozen=True, eq=False)
 class FittedSprings:
-    """arm_fields: of an arm: `joint_compliance`, `link_flexibility`, `base_compliance`, `mass`,
+    """arm_fields: of an arm: `joint_compliances`, `link_flexibility`, `base_compliance`, `mass`,
     `com`, and `remaining_rms`: RMS distance from the laws, or from the measurements [m].
 
     sag, tool_extension: of the tool: (3, 3) turn per direction of gravity [rad], and along its z
@@ -167,7 +167,7 @@ def fit_springs(
     change = inverse @ (right - np.einsum("el,elr->r", sizes, fields))
     values = dict(zip(kinds, (float(c) if c > MIN_COMPLIANCE else 0.0 for c in soft), strict=True))
     held = {
-        "joint_compliance": np.array([values.get(("joint", j), 0.0) for j in range(scene.joints)]),
+        "joint_compliances": np.array([values.get(("joint", j), 0.0) for j in range(scene.joints)]),
         "link_flexibility": {i: c for (kind, i), c in values.items() if kind == "link" and c > 0.0},
         "base_compliance": values.get(("base", 0), 0.0), "mass": mass, "com": com,
         "remaining_rms": 1e-3 * float(np.sqrt((rest**2).sum() / points)),
@@ -316,7 +316,7 @@ class SimulatedArm:
     """What a simulator holds of an arm, joint values in the controller's sense.
 
     mass: (n,) of the links [kg].  com: (n, 3) their centres of gravity in the link frames [m].
-    joint_compliance: (n,) compliance of each joint, 0 stiff [rad/(N m)].  encoder_gain: (n,) of
+    joint_compliances: (n,) compliance of each joint, 0 stiff [rad/(N m)].  encoder_gains: (n,) of
     each encoder. couplings: joint, the joint that turns it too, and how much per radian.  backlash:
     (n,) of each gear, from stop to stop, negative where it runs ahead [rad]. link_flexibility: 1/EI
     of links by index [1/(N m^2)].  base_compliance: [rad/(N m)]. tool_sag: (3, 3) turn of the tool
@@ -330,9 +330,9 @@ class SimulatedArm:
     robot: Robot
     mass: Array
     com: Array
-    joint_compliance: Array
-    encoder_gain: Array
-    backlash: Array
+    joint_compliances: Array
+    encoder_gains: Array
+    backlashes: Array
     couplings: tuple[tuple[int, int, float], ...] = ()
     link_flexibility: dict[int, float] = field(default_factory=dict)
     base_compliance: float = 0.0
@@ -351,15 +351,15 @@ class SimulatedArm:
         zeros = np.zeros(robot.joints)
         mass, com = masses or link_masses_and_centres(robot, MIN_SIMULATED_LINK_MASS)
         return SimulatedArm(
-            robot, mass, com, joint_compliance=zeros, encoder_gain=zeros, backlash=zeros
+            robot, mass, com, joint_compliances=zeros, encoder_gains=zeros, backlashes=zeros
         )
 
     def find_play_positions(self, data: Measurements) -> Array | None:
         """(m, n) where joints rest in their play, by the moves that led to each pose [rad]."""
-        if not self.backlash.any():
+        if not self.backlashes.any():
             return None
         sides = [data.columns[f"approach{i + 1}"] for i in range(data.q.shape[1])]
-        return np.asarray(0.5 * self.backlash * np.stack(sides, axis=1))
+        return np.asarray(0.5 * self.backlashes * np.stack(sides, axis=1))
 
     def format_command_map(self, cell: Cell) -> dict[str, bytes]:
         """The file of the command map by its ending, where there is something to map.
@@ -389,8 +389,8 @@ class SimulatedArm:
                 "one set of masses and springs stands for the effects of the fit, to "
                 f"{1e3 * self.remaining_rms:.2g} mm RMS"
             )
-        if self.backlash.any():
-            joints = ", ".join(f"play{i + 1}" for i in np.flatnonzero(self.backlash))
+        if self.backlashes.any():
+            joints = ", ".join(f"play{i + 1}" for i in np.flatnonzero(self.backlashes))
             limitations.append(
                 f"backlash: {joints} rest amid their play; set qpos_spring of the joint to half "
                 "the play times the sign of the last move"
@@ -593,7 +593,7 @@ def add_joint_compliance(parts: ArmBuilder, scene: PosedArm, term: Term, values:
         parts.compliance_laws.append((term, values))
         parts.needs_imitation = True
         return
-    turn = parts.arm.joint_compliance.copy()
+    turn = parts.arm.joint_compliances.copy()
     for part, value in zip(places, values, strict=True):
         one = Term(term.effect, f"J{part // 4 + 1}", {"parts": numbers_to_bit_mask([part])})
         if value > 0.0:
@@ -601,7 +601,7 @@ def add_joint_compliance(parts: ArmBuilder, scene: PosedArm, term: Term, values:
             parts.compliance_laws.append((one, np.array([value])))
         elif value < 0.0:
             parts.mapped_effects.append((one, np.array([value])))
-    parts.set_arm_fields(joint_compliance=turn)
+    parts.set_arm_fields(joint_compliances=turn)
 
 
 def add_link_or_base_compliance(
@@ -667,8 +667,8 @@ def add_balancer_spring(parts: ArmBuilder, scene: PosedArm, term: Term, values: 
 
 
 EXACT_ELEMENT_WRITERS: dict[str, ElementWriter] = {
-    ENCODER_GAIN.name: joint_field_writer("encoder_gain"),
-    BACKLASH.name: joint_field_writer("backlash"),
+    ENCODER_GAIN.name: joint_field_writer("encoder_gains"),
+    BACKLASH.name: joint_field_writer("backlashes"),
     JOINT_COUPLING.name: add_joint_coupling,
 }
 ELEMENT_WRITERS: dict[str, ElementWriter] = {

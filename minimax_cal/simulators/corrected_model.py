@@ -106,7 +106,7 @@ def correct_model(
     if (
         arm
         and not chain.gravity
-        and (arm.joint_compliance.any() or arm.base_compliance or arm.link_flexibility)
+        and (arm.joint_compliances.any() or arm.base_compliance or arm.link_flexibility)
     ):
         raise RobotError(f"{given.source}: has no gravity, so nothing in it can sag; give it some")
     if arm:
@@ -114,7 +114,7 @@ def correct_model(
         bend = {link: value * factor for link, value in arm.link_flexibility.items()}
         arm = replace(
             arm,
-            joint_compliance=arm.joint_compliance * factor,
+            joint_compliances=arm.joint_compliances * factor,
             base_compliance=arm.base_compliance * factor,
             link_flexibility=bend,
             tool_sag=arm.tool_sag * factor,

@@ -133,11 +133,11 @@ def design_servos(
     # A servo under the share s of gravity with the gain s/c deflects as the compliance c does.
     needed = SERVO_FREQUENCY**2 * inertia
     ordinary = np.maximum(given.gain, np.maximum(needed, MIN_GAIN_SHARE * needed.max()))
-    is_soft = arm.joint_compliance > NEGLIGIBLE_COMPLIANCE
-    share = min(1.0, float((arm.joint_compliance * ordinary).max()))
+    is_soft = arm.joint_compliances > NEGLIGIBLE_COMPLIANCE
+    share = min(1.0, float((arm.joint_compliances * ordinary).max()))
     lever = np.where(robot.prismatic, 1.0, arm.largest_levers)
     stiff = np.maximum(ordinary, share * torque * lever / MAX_STIFF_SAG)
-    gain = np.where(is_soft, share / np.where(is_soft, arm.joint_compliance, np.inf), stiff)
+    gain = np.where(is_soft, share / np.where(is_soft, arm.joint_compliances, np.inf), stiff)
     is_sprung = np.zeros(len(gain), dtype=bool)
     if with_springs or gain.max() > MAX_GAIN_RATIO * ordinary.max():
         share, gain, is_sprung = 0.0, ordinary, is_soft
@@ -179,7 +179,7 @@ def write_arm_elements(
         write_servos(layout, arm, servos)
     write_springs(layout, arm, servos, servos.load_share if with_servos else 1.0)
     if arm.balance:
-        own = np.where(servos.is_sprung, arm.joint_compliance, 0.0)[1]
+        own = np.where(servos.is_sprung, arm.joint_compliances, 0.0)[1]
         held = 1.0 / servos.gain[1] if with_servos else MOTOR_COMPLIANCE
         write_balancer(layout, arm, 1.0 / (held + own))
     if target_names is not None:
@@ -207,8 +207,8 @@ def write_servos(layout: ArmLayout, arm: SimulatedArm, servos: ServoDesign) -> N
     for i, name in enumerate(layout.joint_names):
         # Gain and damper at the motor, whose gear holds the encoder's gain.
         servo = tree.find_servo(name)
-        gear = 1.0 / (1.0 + arm.encoder_gain[i])
-        if not servos.is_kept[i] or arm.encoder_gain[i]:
+        gear = 1.0 / (1.0 + arm.encoder_gains[i])
+        if not servos.is_kept[i] or arm.encoder_gains[i]:
             damper = servos.damper[i]
             if given.damped_by_joint[i]:
                 layout.joints[i].set("damping", format_exact_numbers([damper]))
@@ -216,13 +216,13 @@ def write_servos(layout: ArmLayout, arm: SimulatedArm, servos: ServoDesign) -> N
             damper = max(damper - given.joint_damping[i], 0.0) / gear**2
             set_servo_gains(servo, servos.gain[i] / gear**2, damper)
         tree.remove("custom", "text", f"{name}_deflection")  # of a calibration before
-        if arm.joint_compliance[i] > NEGLIGIBLE_COMPLIANCE and not servos.is_sprung[i]:
+        if arm.joint_compliances[i] > NEGLIGIBLE_COMPLIANCE and not servos.is_sprung[i]:
             text = (
                 f"the gain of {servo.get('name')} is a spring: under gravity {name} turns by "
-                f"{arm.joint_compliance[i]:.6g} rad/(N m); another gain is another deflection"
+                f"{arm.joint_compliances[i]:.6g} rad/(N m); another gain is another deflection"
             )
             set_element(tree.section("custom"), "text", f"{name}_deflection", data=text)
-        if arm.encoder_gain[i]:
+        if arm.encoder_gains[i]:
             servo.set("gear", format_exact_numbers([gear]))
 
         # Couplings: the servo drives a linear combination of joints.
@@ -304,16 +304,16 @@ def write_springs(
     for i in np.flatnonzero(servos.is_sprung).tolist():
         kind = "slide" if robot.prismatic[i] else "hinge"
         add_spring(bodies[i], f"flex{i + 1}", kind, layout.anchors[i], layout.axes[i],
-                   1.0 / arm.joint_compliance[i], inertia[i])  # fmt: skip
+                   1.0 / arm.joint_compliances[i], inertia[i])  # fmt: skip
 
     # Backlash: a hinge with stops half the play away on either side, and a spring that holds it.
-    for i in np.flatnonzero(arm.backlash).tolist():
+    for i in np.flatnonzero(arm.backlashes).tolist():
         sag = load_share * (servos.gravity_torque[i] * arm.largest_levers[i]) / MAX_STIFF_SAG
         hinge = add_spring(
             bodies[i], f"play{i + 1}", "hinge", layout.anchors[i], layout.axes[i],
             max(sag, inertia[i] / SPRING_TIME**2), inertia[i], feels_all_gravity=False
         )  # fmt: skip
-        ends = np.array([-1.01, 1.01]) * (0.5 * abs(arm.backlash[i]))  # the spring ends inside
+        ends = np.array([-1.01, 1.01]) * (0.5 * abs(arm.backlashes[i]))  # the spring ends inside
         hinge.set("limited", "true")
         hinge.set(
             "range", format_exact_numbers(np.degrees(ends) if layout.tree.uses_degrees else ends)

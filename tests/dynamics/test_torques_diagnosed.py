@@ -208,6 +208,7 @@ def test_efforts_of_another_unit_or_sign_are_no_drive_gain(scale: list[float]) -
     assert names(found) == set()
     factors = dict(re.findall(r"joint (\d) are (\S+) times", "\n".join(found.notices)))
     assert abs(float(factors["2"]) - 1.0) > 0.5
+    assert any("i1_A, i2_A" in notice for notice in found.notices)  # the columns of the mend
     assert "drive_gain" in {one.effect for one in found.not_testable}
     coulomb = {e.place: e.parameters[0].value for e in found.effects if e.effect == "coulomb"}
     for place, value in coulomb.items():

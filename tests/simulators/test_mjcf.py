@@ -238,7 +238,7 @@ def test_a_joint_that_stiffens_goes_into_the_commands_and_not_into_springs():
     cell = cell_with(robot, "joint_compliance:J2:within=20", joint_compliance=[3e-6])
     arm = build_simulated_arm(cell)
     assert [term.label for term in arm.mapped_effects.terms] == ["joint_compliance:J2"]
-    assert not arm.joint_compliance.any()
+    assert not arm.joint_compliances.any()
     assert np.isnan(joint_compliances(cell)[1])  # one number does not tell it
     plain = cell_with(robot, "joint_compliance:J2", joint_compliance=[3e-6])
     assert joint_compliances(plain)[1] == 3e-6

@@ -123,7 +123,7 @@ def cross(u: Array, v: Array) -> Array:
 def link_frames_in_flange(
     mdh: Array, q: Array, prismatic: Array, first_pose: int, end_pose: int
 ) -> Array:
-    """The arm as seen from the flange, at the poses lo to end_pose: (B, 8n + 4, 3, c) [m].
+    """The arm as seen from the flange, at the poses first_pose to end_pose: (B, 8n + 4, 3, c) [m].
 
     mdh: (B, n, 5).  q: (m, n).  In fours, first the frames from the base (0) to the flange (n):
     three axes and the origin.  Then of each joint the axes of the frame before it, turned by theta

@@ -475,7 +475,7 @@ def apply_calibration(opened: OpenedModel, fit: Fit) -> tuple[OpenedModel, tuple
     driven = bool((opened.chain.servo_ids >= 0).any())
     made = correct_model(opened.given, opened.chain, nominal, arm, names, with_servos=driven)
     notices = made.notices
-    if not driven and (arm.encoder_gain.any() or arm.couplings):
+    if not driven and (arm.encoder_gains.any() or arm.couplings):
         notices += (
             "not in the model: encoder gains and couplings, which only position servos hold",
         )
