@@ -185,7 +185,7 @@ def oracle_visibility(case_data: MotionCaseData, truth: tuple[Name, ...]) -> tup
     )
     scene = ArmMotion.build(arm, logs)
     columns = FittedBody.fit_with_friction(scene).build_torque_columns(scene)
-    kept = logs.is_row_fitted.T
+    kept = logs.fitted_row_mask_by_joint.T
     white = estimate_autoregressive_whitening(
         logs, logs_with_torques(case_data, case_data.noise).row_torques.T[kept]
     )

@@ -16,7 +16,7 @@ from minimax_cal.fitting.options import silent_progress
 from minimax_cal.measuring.measurements import Measurements, read_measurements
 from minimax_cal.measuring.pose_groups import split_train_and_holdout
 from minimax_cal.measuring.visit_history import add_history_columns
-from minimax_cal.modelling.arm_laws import build_arm_library
+from minimax_cal.modelling.arm_laws import build_library_of_testable_arm_laws
 from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.selection.candidate_library import CandidateLibrary
 from minimax_cal.selection.noise_model import estimate_noise_by_reml
@@ -44,7 +44,7 @@ def effect_similarities(
     study = replace(
         study, jump_times=clock[MIN_VISITS_AROUND_JUMP : len(clock) - MIN_VISITS_AROUND_JUMP]
     )
-    lib = add_session_jumps(build_arm_library(study.scene, study.rows), study)
+    lib = add_session_jumps(build_library_of_testable_arm_laws(study.scene, study.rows), study)
     return resemblances(lib, study.rows.rows_from_fields(moved[None]))
 
 

@@ -203,7 +203,7 @@ def draw_servo_arm(
 def largest_joint_inertias(arm: DrivenArm) -> Array:
     """(n,) largest inertia about each joint of the file [kg m^2]."""
     model = arm.compiled_file_model
-    return find_model_arm(model, arm.robot.joints, arm.robot.name).find_largest_inertias()
+    return find_model_arm(model, arm.robot.joints, arm.robot.name).largest_inertias_over_workspace()
 
 
 @dataclass(frozen=True)

@@ -50,7 +50,7 @@ from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.visit_history import add_history_columns
 from minimax_cal.modelling import global_start
 from minimax_cal.modelling.effects.table import Fitted, Term
-from minimax_cal.modelling.nearby_fit import fit_nearby
+from minimax_cal.modelling.nearby_fit import fit_within_bounds_from_start
 from minimax_cal.modelling.parameters import ParameterValues
 from minimax_cal.modelling.point_model import PointLeastSquares, PointModel, build_point_model
 from minimax_cal.modelling.simulate import simulate
@@ -142,7 +142,7 @@ def to_raw_arrays(case: SpeedCase, data: Measurements) -> RawCalibration:
 
 def solve_least_squares(case: SpeedCase) -> ParameterValues:
     """Our least squares from the nominal start."""
-    return fit_nearby(case.model, case.begin).x.take(np.array(0))
+    return fit_within_bounds_from_start(case.model, case.begin).x.take(np.array(0))
 
 
 def solve_minimax_over_targets(case: SpeedCase) -> float:

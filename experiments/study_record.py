@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from scipy.stats import beta
 
-from minimax_cal.core.files import format_json, to_plain_json, write_file_atomically
+from minimax_cal.core.files import convert_to_plain_json, format_json, write_file_atomically
 from minimax_cal.core.tables import Table
 from minimax_cal.reporting.plots.error_figure import write_figure
 
@@ -116,7 +116,7 @@ def write_figure_files(folder: Path, name: str, figure: Figure) -> None:
 def write_json(path: Path, content: Mapping[str, object]) -> None:
     """Write the figures of a study for other programs: null for what is not known (NaN)."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_file_atomically(path, format_json({"schema": 1, **to_plain_json(content)}))
+    write_file_atomically(path, format_json({"schema": 1, **convert_to_plain_json(content)}))
 
 
 def build_run_record(command: str, packages: Iterable[str] = ()) -> dict[str, str]:

@@ -193,7 +193,7 @@ def run_calls_in_parallel(
     """
     if not calls:
         return
-    work = [(function, number, call) for number, call in enumerate(calls)]
+    work = [parallel.Task(function, number, call) for number, call in enumerate(calls)]
     needed = {parallel.__name__, function.__module__, *modules}
     arriving = (
         parallel.run_on_cluster(work, cluster, needed)

@@ -34,7 +34,7 @@ from minimax_cal.modelling.parameters import ParameterValues
 from minimax_cal.modelling.point_model import PointModel
 from minimax_cal.solvers import minimax
 from minimax_cal.solvers.epigraph_qp import ignore_warm_start
-from minimax_cal.solvers.linearisation import Linearisation
+from minimax_cal.solvers.linearisation import FunctionsAndConstraints, Linearisation
 from qp_backends import solve as solve_qp
 
 DAQP_SOLVER = ignore_warm_start(partial(solve_qp, name="daqp", tolerance=FIT_QP_TOLERANCE))
@@ -63,10 +63,10 @@ class SumOfSquaresProblem:
         """(l,) of the constraints."""
         return self.problem.upper
 
-    def evaluate(self, x: ParameterValues) -> tuple[Array, Array]:
+    def evaluate(self, x: ParameterValues) -> FunctionsAndConstraints:
         """The mean square (1,), and the constraints (l,)."""
         f, c = self.problem.evaluate(x)
-        return np.array([self.share @ f]), c
+        return FunctionsAndConstraints(np.array([self.share @ f]), c)
 
     def linearise(self, x: ParameterValues) -> Linearisation:
         """The same with derivatives."""

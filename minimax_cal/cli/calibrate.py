@@ -23,7 +23,7 @@ from minimax_cal.cli.options import (
     run_on_any_instruments,
     split_camera_files,
 )
-from minimax_cal.core.files import format_json, to_plain_json
+from minimax_cal.core.files import convert_to_plain_json, format_json
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.multi_instrument.options import RelativeOptions
@@ -122,7 +122,7 @@ def calibrate_command(
         fit,
         status=fit.status,
         reason=fit.reason,
-        json=lambda: format_json(fit.to_dict(poses=not without) | to_plain_json(more)),
+        json=lambda: format_json(fit.to_dict(poses=not without) | convert_to_plain_json(more)),
         sentences=(*fit.sentences(), *[fit.describe_solution()] * to.details),
         more=[found.table() for found in more.values()],
         advice=suggest_next_commands(fit, robot, data, to.output),

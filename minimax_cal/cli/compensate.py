@@ -34,7 +34,7 @@ from minimax_cal.compensation.programs.robot_program import (
     read_robot_program,
 )
 from minimax_cal.compensation.target_file import TargetFile, read_target_file
-from minimax_cal.core.display_text import replace_control_characters
+from minimax_cal.core.display_text import replace_invisible_and_bidi_characters
 from minimax_cal.core.errors import CalibrationError, OptionError
 from minimax_cal.core.option_fields import Option
 from minimax_cal.fitting.opened_results import open_result
@@ -141,4 +141,4 @@ def load_nominal_robot(fit_path: Path, step_number: int | None) -> Robot:
 
 def replace_control_characters_in_lines(text: str) -> str:
     """A file for people to look at: its cells may hold codes that move a cursor."""
-    return "".join(f"{replace_control_characters(line)}\n" for line in text.splitlines())
+    return "".join(f"{replace_invisible_and_bidi_characters(line)}\n" for line in text.splitlines())

@@ -18,7 +18,7 @@ from minimax_cal.cli.options import (
     options_from_parameters,
 )
 from minimax_cal.core.errors import CalibrationError, OptionError
-from minimax_cal.core.files import read_saved_json
+from minimax_cal.core.files import read_saved_result_json
 from minimax_cal.core.option_fields import Option
 from minimax_cal.dynamics.cross_validation import MotionEvaluation, evaluate_motion
 from minimax_cal.dynamics.result import MotionDiagnosis
@@ -28,7 +28,7 @@ from minimax_cal.validation.evaluation import Evaluation, evaluate_with_notices
 def read_result_kind(path: Path) -> str:
     """The kind that a result file says; empty where it says none."""
     with suppress(CalibrationError):
-        return str(read_saved_json(path).get("kind", ""))
+        return str(read_saved_result_json(path).get("kind", ""))
     return ""
 
 

@@ -23,7 +23,7 @@ from minimax_cal.cli.options import (
     print_tables,
     refuse_given_options,
 )
-from minimax_cal.core.files import format_json, to_plain_json
+from minimax_cal.core.files import convert_to_plain_json, format_json
 from minimax_cal.core.option_fields import Option
 from minimax_cal.core.tables import Table
 from minimax_cal.dynamics.logs import LogFiles, are_logs, read_log_files
@@ -128,7 +128,7 @@ def write_and_print_import(
     """Write and show what was understood."""
     content = {"schema": 1, "output": output.output and str(output.output), **imported.to_dict()}
     wanted = output.write_result_or_print_json(
-        lambda: format_json(to_plain_json(content)), make_csv=make_csv
+        lambda: format_json(convert_to_plain_json(content)), make_csv=make_csv
     )
     output.print_notices(*content["notices"])
     if wanted:

@@ -28,7 +28,7 @@ from minimax_cal.validation.workspace_maps import (
     Predict,
     build_radius_predictor,
     build_workspace_map,
-    predict_unknown,
+    predict_nan_radius,
 )
 
 
@@ -42,8 +42,8 @@ def build_predictors(
     known, cell = saved.uncertainty, saved.cells[AFTER]
     if known is None:
         return (
-            predict_unknown,
-            predict_unknown,
+            predict_nan_radius,
+            predict_nan_radius,
             (f"{source}: holds no covariance, so nothing is predicted",),
         )
     return (

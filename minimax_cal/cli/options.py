@@ -27,9 +27,17 @@ from minimax_cal.cli.stderr_events import (
     report_error,
     report_event,
 )
-from minimax_cal.core.display_text import escape_spreadsheet_formulas, replace_control_characters
+from minimax_cal.core.display_text import (
+    escape_spreadsheet_formulas,
+    replace_invisible_and_bidi_characters,
+)
 from minimax_cal.core.errors import OptionError
-from minimax_cal.core.files import check_writable, format_json, to_plain_json, write_file_atomically
+from minimax_cal.core.files import (
+    check_output_path,
+    convert_to_plain_json,
+    format_json,
+    write_file_atomically,
+)
 from minimax_cal.core.option_fields import (
     SI_PER_OPTION_UNIT,
     Option,
@@ -468,7 +476,9 @@ class CommandOutput:
             replace_arguments_by_current_flags(text) for text in sentences or [result.headline()]
         ]
         if self.details:
-            open_stdout_console().print(Text(replace_control_characters(" ".join(sentences))))
+            open_stdout_console().print(
+                Text(replace_invisible_and_bidi_characters(" ".join(sentences)))
+            )
             click.echo()
         if self.details or not self.keep:
             print_tables(*(tables or result.tables)(), *more)
@@ -481,14 +491,14 @@ class CommandOutput:
         )
         console = Console(highlight=False, width=width)
         for sentence in sentences:
-            console.print(Text(replace_control_characters(sentence)))
+            console.print(Text(replace_invisible_and_bidi_characters(sentence)))
         click.echo()
         for table in (*result.first_tables(), *more):
             table.print_to_console(console)
         for purpose, line in self.suggest_keeping_result() if advice is None else advice:
-            console.print(Text(replace_control_characters(f"{purpose}:")))
+            console.print(Text(replace_invisible_and_bidi_characters(f"{purpose}:")))
             whole.print(
-                Text(replace_control_characters(f"  {line}")), soft_wrap=True
+                Text(replace_invisible_and_bidi_characters(f"  {line}")), soft_wrap=True
             )  # to be copied in one piece
 
     def suggest_keeping_result(self) -> NextCommands:
@@ -647,7 +657,9 @@ def print_tables(*tables: Table, headline: str = "") -> None:
     """Print what tables come to on stdout, and the tables."""
     console = open_stdout_console()
     if headline:
-        console.print(Text(replace_control_characters(headline)), soft_wrap=not console.is_terminal)
+        console.print(
+            Text(replace_invisible_and_bidi_characters(headline)), soft_wrap=not console.is_terminal
+        )
         click.echo()
     for table in tables:
         table.print_to_console(console)
@@ -657,7 +669,7 @@ def check_writable_paths(*paths: Path | None) -> None:
     """Raise an error, before any work, for an output that cannot be written."""
     for path in paths:
         if path:
-            check_writable(path)
+            check_output_path(path)
 
 
 def check_drawable_path(path: Path | None) -> None:
@@ -668,7 +680,7 @@ def check_drawable_path(path: Path | None) -> None:
             PICTURE_SUFFIXES,
         )
 
-        check_writable(path, PICTURE_SUFFIXES)
+        check_output_path(path, PICTURE_SUFFIXES)
         if find_spec("matplotlib") is None:
             raise OptionError(MATPLOTLIB_NEEDED_MESSAGE)
 
@@ -686,7 +698,7 @@ def report_status_as_exit_code(status: Status, reason: str = "") -> int:
 def print_json_or_tables(as_json: bool, content: object, *tables: Table) -> int:
     """Print JSON, or tables; the exit code."""
     if as_json:
-        click.echo(format_json(to_plain_json(content)), nl=False)
+        click.echo(format_json(convert_to_plain_json(content)), nl=False)
     else:
         print_tables(*tables)
     return 0

@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from minimax_cal.cli import FAILED_EXIT_CODE
-from minimax_cal.core.display_text import shorten_to_one_line
+from minimax_cal.core.display_text import clean_and_shorten_to_one_line
 
 IS_JSON_PROGRESS: ContextVar[bool] = ContextVar(
     "AS_JSON", default=False
@@ -57,7 +57,7 @@ def report_detected_file_kinds() -> None:
 
 def print_event_line(event: str, text: str, **json_fields: Any) -> None:
     """A line on stderr."""
-    line = shorten_to_one_line(text)
+    line = clean_and_shorten_to_one_line(text)
     if IS_JSON_PROGRESS.get():
         click.echo(json.dumps({"event": event, "text": line, **json_fields}), err=True)
     else:

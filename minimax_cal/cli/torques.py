@@ -17,7 +17,7 @@ from minimax_cal.cli.options import (
     options_from_parameters,
     take_option_record,
 )
-from minimax_cal.core.files import check_writable, format_json
+from minimax_cal.core.files import check_output_path, format_json
 from minimax_cal.core.option_fields import Option
 from minimax_cal.dynamics.diagnose import diagnose_motion
 from minimax_cal.dynamics.known_inputs import MotionKnown, read_checked_runs, read_runs_of_robot
@@ -73,7 +73,7 @@ def torques_command(
     values and torques or currents, as CSV of this project, RTDE, ROS or LeRobot.
     """
     if write is not None:
-        check_writable(write, MJCF_SUFFIXES)
+        check_output_path(write, MJCF_SUFFIXES)
     known, runs = take_option_record(MotionKnown, dict(chosen)), read_runs_of_robot(model, logs)
     arm = load_torque_robot(model, runs)
     if write is not None:  # before what takes long

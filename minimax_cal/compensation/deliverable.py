@@ -73,7 +73,7 @@ class AccuracyFigures:
         )
 
     @staticmethod
-    def from_result_step(opened_result: OpenedResult) -> AccuracyFigures:
+    def from_heldout_poses_of_step(opened_result: OpenedResult) -> AccuracyFigures:
         """Of the rung of a result."""
         last, rung = (
             opened_result.number == len(opened_result.rungs) - 1,
@@ -268,7 +268,7 @@ def deliver_or_describe_failure(
     except (CalibrationError, np.linalg.LinAlgError) as error:
         known = open_result(fit, step_number)
         whole, why = (
-            AccuracyFigures.from_result_step(known),
+            AccuracyFigures.from_heldout_poses_of_step(known),
             " ".join(str(error).split()).removeprefix(f"{format_name}: "),
         )
         return Delivered(
@@ -346,9 +346,9 @@ def fit_deliverable(
     """
     if opened_result.status is Status.FAILED:
         raise OptionError(f"{opened_result.source}: {Status.FAILED}: {Status.FAILED.advice}")
-    cell, whole = opened_result.cell, AccuracyFigures.from_result_step(opened_result)
+    cell, whole = opened_result.cell, AccuracyFigures.from_heldout_poses_of_step(opened_result)
     only = EXPORTERS[format_name].only if format_name in EXPORTERS and opened_result.number else ""
-    held = list_carried_effects(opened_result, format_name, session_moment)
+    held = list_effects_outliving_session(opened_result, format_name, session_moment)
     data = (
         opened_result.data
         if has_measured_torques
@@ -452,7 +452,7 @@ def list_effects_held_by_format(format_name: str, cell: Cell) -> tuple[Term, ...
     return tuple(t for t in cell.effects.cause_terms if t in own or EFFECTS[t.effect].of_past)
 
 
-def list_carried_effects(
+def list_effects_outliving_session(
     opened_result: OpenedResult, format_name: str, session_moment: float | None
 ) -> tuple[Term, ...]:
     """The effects of a result that a deliverable holds.

@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
@@ -400,20 +400,30 @@ def collect_compensation_notices(arm_cell: Cell, measurements: Measurements) -> 
     return out
 
 
+class NominalPlacement(NamedTuple):
+    """Base and flange offset of the nominal arm (4, 4), and notices."""
+
+    base: Array
+    tool: Array
+    notices: tuple[str, ...]
+
+
 def place_nominal_robot(
     cell: Cell, arm_cell: Cell, nominal: Robot, nominal_cell: Cell | None, frame: str
-) -> tuple[Array, Array, tuple[str, ...]]:
+) -> NominalPlacement:
     """Where the nominal arm stands: its base in the calibrated base, its flange's own offset.
 
     (4, 4) each: the goal of the calibrated flange is base @ nominal pose @ tool.  And notices.
     """
     if frame == "own":
-        return np.eye(4), np.eye(4), ()
+        return NominalPlacement(np.eye(4), np.eye(4), ())
     if nominal_cell:
         base = np.linalg.inv(cell.base) @ nominal_cell.base
         if frame == "flange":
-            return base, np.eye(4), ()
-        return base, fit_rigid_motions(cell.target_positions, nominal_cell.target_positions), ()
+            return NominalPlacement(base, np.eye(4), ())
+        return NominalPlacement(
+            base, fit_rigid_motions(cell.target_positions, nominal_cell.target_positions), ()
+        )
     q = random_joint_values_above_floor(nominal, BASE_PLACEMENT_POSES, np.random.default_rng(0))
     turn, moved = effect_joint_shifts_and_flange_motions(
         arm_cell, build_measurements_at_rest(q, arm_cell.target_names, arm_cell.robot)
@@ -436,4 +446,4 @@ def place_nominal_robot(
         f"the nominal base was placed by {BASE_PLACEMENT_POSES} "
         f"poses of the two models, not by the measurements"
     )
-    return base, tool, (said,)
+    return NominalPlacement(base, tool, (said,))

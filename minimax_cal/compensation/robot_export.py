@@ -22,7 +22,7 @@ from minimax_cal.compensation.exporters.export_job import (
     open_export_source,
 )
 from minimax_cal.core.errors import OptionError
-from minimax_cal.core.files import check_writable, write_file_atomically
+from minimax_cal.core.files import check_output_path, write_file_atomically
 from minimax_cal.core.option_fields import option_field_in_group, take_option_fields_as_keywords
 from minimax_cal.fitting.opened_results import ResultOrFile
 from minimax_cal.robots.robot import Robot
@@ -130,7 +130,7 @@ def export(
     >>> text = mc.export(fit, to="urdf", path="arm.urdf")
     """
     if path is not None:
-        check_writable(path)
+        check_output_path(path)
     place = None if path is None else Path(path)
     made = build_export(fit, to, place, options)
     write_exported_files(made.file, place)

@@ -8,6 +8,7 @@ import re
 import unicodedata
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from typing import NamedTuple
 
 HIDDEN_CHARACTER_CLASSES = (
     "Cc",
@@ -44,13 +45,13 @@ def capitalise_sentence(sentence: str) -> str:
     return sentence[:1].upper() + sentence[1:] if plain else sentence
 
 
-def format_counts(counts: Mapping[str, int]) -> str:
+def format_counts_largest_first(counts: Mapping[str, int]) -> str:
     """How many by whom, the most first, as 4 by daqp, 1 by highs."""
     most_first = sorted(counts.items(), key=lambda item: -item[1])
     return ", ".join(f"{count} by {name}" for name, count in most_first)
 
 
-def replace_control_characters(text: str) -> str:
+def replace_invisible_and_bidi_characters(text: str) -> str:
     """Text without control characters, which could hide or reverse what a reader signs."""
     if text.isascii() and text.isprintable():
         return text
@@ -63,9 +64,9 @@ def replace_control_characters(text: str) -> str:
     )
 
 
-def shorten_to_one_line(text: str) -> str:
+def clean_and_shorten_to_one_line(text: str) -> str:
     """A message in one line that hides nothing and floods no terminal."""
-    line = replace_control_characters(" ".join(text.split()))
+    line = replace_invisible_and_bidi_characters(" ".join(text.split()))
     return (
         line
         if len(line) <= MAX_MESSAGE_LETTERS
@@ -73,13 +74,20 @@ def shorten_to_one_line(text: str) -> str:
     )
 
 
-def blank_matches(text: str, pattern: re.Pattern[str]) -> str:
+def replace_matches_with_spaces(text: str, pattern: re.Pattern[str]) -> str:
     """Text with what matches turned into spaces; line ends stay."""
     return pattern.sub(lambda found: re.sub(r"[^\r\n]", " ", found[0]), text)
 
 
-def escape_spreadsheet_formulas(csv_text: str) -> tuple[str, int]:
-    """CSV with an apostrophe before each cell that a spreadsheet would run; how many there are."""
+class EscapedCsv(NamedTuple):
+    """A CSV text whose formulas are escaped, and the number of cells that were."""
+
+    text: str
+    escaped_cell_count: int
+
+
+def escape_spreadsheet_formulas(csv_text: str) -> EscapedCsv:
+    """Put an apostrophe before each cell that a spreadsheet would run as a formula."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     count = 0
@@ -87,7 +95,7 @@ def escape_spreadsheet_formulas(csv_text: str) -> tuple[str, int]:
         runs = [is_spreadsheet_formula(cell) for cell in row]
         count += sum(runs)
         writer.writerow([f"'{cell}" if run else cell for cell, run in zip(row, runs, strict=True)])
-    return stream.getvalue(), count
+    return EscapedCsv(stream.getvalue(), count)
 
 
 def is_spreadsheet_formula(cell: str) -> bool:

@@ -29,7 +29,7 @@ class CalibrationWarning(UserWarning):
     """A result that should not be used before its reason has been looked at."""
 
 
-def describe_error(error: Exception) -> str:
+def describe_file_content_error(error: Exception) -> str:
     """What is wrong with the content of a file, without Python's and NumPy's words for it."""
     text = str(error).partition("\n")[0]
     if isinstance(error, KeyError):

@@ -13,14 +13,14 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import is_dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 
 from minimax_cal.core.arrays import Array
 from minimax_cal.core.errors import CalibrationError, OptionError
 from minimax_cal.core.record_fields import LazyValue, record_to_file_values
-from minimax_cal.core.write_journal import back_up_before_write, unused_hidden_path
+from minimax_cal.core.write_journal import link_backup_in_journal, unused_hidden_path_in_folder_of
 
 MAX_FILE_BYTES = 1 << 30  # bytes of a file that is read: a million poses take a quarter of this
 NO_FSYNC_VARIABLE = (
@@ -36,8 +36,11 @@ MAX_JSON_NUMBER = (
 )
 
 
+JsonValue = Any  # what JSON holds: object, list, text, number, truth value or None
+
+
 def write_file_atomically(path: Path | str, content: str | bytes) -> None:
-    """Write content to path in one step: a reader sees the old file or the new one.
+    """Write content to a path in one step: a reader sees the old file or the new one.
 
     So does who starts the machine again after a power cut: file and folder are on the disk before
     this returns.  Raises CalibrationError when the folder does not exist or cannot be written.
@@ -47,13 +50,13 @@ def write_file_atomically(path: Path | str, content: str | bytes) -> None:
     if path.exists() and not path.is_file():
         write_to_pipe_or_device(path, raw)
         return
-    with open_temporary_file(path) as (handle, part):
+    with create_temporary_file_in_folder_of(path) as (handle, part):
         try:
             with os.fdopen(handle, "wb") as stream:
                 stream.write(raw)
                 flush_to_disk(stream)
-            os.chmod(part, file_mode_or_default(path))
-            back_up_before_write(path)
+            os.chmod(part, file_mode_or_umask_default(path))
+            link_backup_in_journal(path)
             replace_file_durably(part, path)
         except OSError as error:
             raise CalibrationError(f"{path}: cannot be written ({error.strerror})") from error
@@ -90,21 +93,28 @@ def replace_file_durably(new_file: Path | str, path: Path) -> None:
         os.close(folder)
 
 
+class TemporaryFile(NamedTuple):
+    """An open file and its path."""
+
+    descriptor: int
+    path: Path
+
+
 @contextmanager
-def open_temporary_file(path: Path) -> Iterator[tuple[int, Path]]:
-    """A new private file in the folder of a path, open, and its name.  Raises CalibrationError.
+def create_temporary_file_in_folder_of(path: Path) -> Iterator[TemporaryFile]:
+    """Create a private, empty file in the folder of a path.  Raises CalibrationError.
 
     In the end it is gone, unless it has another name by then: the name is known before the file is
     there, so that no signal can leave it behind.
     """
-    part = unused_hidden_path(path)
+    part = unused_hidden_path_in_folder_of(path)
     flags = os.O_CREAT | os.O_EXCL | os.O_WRONLY | getattr(os, "O_BINARY", 0)
     try:
         try:
             handle = os.open(part, flags, 0o600)
         except OSError as error:
             raise CalibrationError(f"{path}: cannot be written ({error.strerror})") from error
-        yield handle, part
+        yield TemporaryFile(handle, part)
     finally:
         with suppress(OSError):  # a folder that cannot be written holds no part
             part.unlink(missing_ok=True)
@@ -122,7 +132,7 @@ def resolve_output_path(path: Path | str) -> Path:
     return there
 
 
-def file_mode_or_default(path: Path) -> int:
+def file_mode_or_umask_default(path: Path) -> int:
     """The permissions of a file that is there, else those of any new one."""
     if path.exists():
         return path.stat().st_mode & 0o777
@@ -140,7 +150,7 @@ def write_to_pipe_or_device(path: Path, content: bytes) -> None:
         raise CalibrationError(f"{path}: cannot be written ({error.strerror})") from error
 
 
-def check_writable(path: Path | str, allowed_suffixes: tuple[str, ...] = ()) -> None:
+def check_output_path(path: Path | str, allowed_suffixes: tuple[str, ...] = ()) -> None:
     """Raise CalibrationError now, before the work, if path cannot be written later.
 
     allowed_suffixes: the endings that are allowed, any if empty.
@@ -156,7 +166,7 @@ def check_writable(path: Path | str, allowed_suffixes: tuple[str, ...] = ()) -> 
     if not there.parent.is_dir():
         raise CalibrationError(f"{path}: cannot be written (there is no such folder)")
     if there.is_file() or not there.exists():  # no pipe and no device
-        with open_temporary_file(there) as (handle, _):
+        with create_temporary_file_in_folder_of(there) as (handle, _):
             os.close(handle)
 
 
@@ -181,7 +191,7 @@ def format_csv(rows: Iterable[Sequence[object]]) -> str:
     return stream.getvalue()
 
 
-def parse_json(text: str | bytes) -> Any:
+def parse_json(text: str | bytes) -> JsonValue:
     """JSON whose every key stands once, of numbers to reckon with; NaN and Infinity are no JSON.
 
     Raises ValueError, also for lists in lists that Python's stack cannot hold.
@@ -221,7 +231,7 @@ def build_object_with_unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any
     return out
 
 
-def to_plain_json(content: Any) -> Any:
+def convert_to_plain_json(content: Any) -> JsonValue:
     """Data as JSON holds them: arrays are lists, records their fields, null no finite number."""
     if isinstance(content, LazyValue):
         content = content.value
@@ -232,11 +242,11 @@ def to_plain_json(content: Any) -> Any:
     elif hasattr(content, "_asdict"):
         content = content._asdict()
     if isinstance(content, Mapping):
-        return {key: to_plain_json(value) for key, value in content.items()}
+        return {key: convert_to_plain_json(value) for key, value in content.items()}
     if isinstance(content, np.ndarray | np.generic):
         content = content.tolist()
     if isinstance(content, list | tuple):
-        return [to_plain_json(value) for value in content]
+        return [convert_to_plain_json(value) for value in content]
     return None if isinstance(content, float) and not math.isfinite(content) else content
 
 
@@ -279,7 +289,7 @@ class NotSavedResultError(CalibrationError):
     """A file that holds no saved result."""
 
 
-def read_saved_json(path: Path | str) -> Mapping[str, Any]:
+def read_saved_result_json(path: Path | str) -> Mapping[str, JsonValue]:
     """The JSON of a saved result.  Raises NotSaved."""
     try:
         content = parse_json(read_text(path, error_type=NotSavedResultError))

@@ -146,7 +146,9 @@ def split_comma_separated_names(texts: Iterable[str]) -> tuple[str, ...]:
     return tuple(name.strip() for text in texts for name in text.split(",") if name.strip())
 
 
-def check_excluded_effects(excluded_names: Iterable[str], known_effects: Collection[str]) -> None:
+def check_excluded_effects_are_known(
+    excluded_names: Iterable[str], known_effects: Collection[str]
+) -> None:
     """Raise OptionError for an effect to leave out that nobody knows."""
     for name in excluded_names:
         if name not in known_effects:
@@ -174,7 +176,7 @@ def parse_finite_numbers(
     return parts
 
 
-def parse_triple_in_mm(text: str, name: str) -> tuple[float, ...]:
+def parse_millimetre_triple_to_metres(text: str, name: str) -> tuple[float, ...]:
     """Three lengths in millimetres, in metres.  Raises OptionError."""
     return tuple(
         1e-3 * part for part in parse_finite_numbers(text, name, "x,y,z in mm, as 3000,0,500", 3)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 from contextlib import contextmanager, suppress
 from importlib import import_module
-from typing import Any
+from typing import Any, NamedTuple
 
 import threadpoolctl
 
@@ -41,11 +41,28 @@ DISTRIBUTED_REQUIREMENT = "minimax-cal[distributed]"
 
 REUSED_PROCESS_POOL: list[
     Any
-] = []  # the pool of this process that `run_in_processes` made last, which stays for the next
+    # the pool of this process that `run_in_processes_and_here` made last, which stays for the next
+] = []
 
-IndexedResults = Generator[tuple[int, Any], None, None]
-Tasks = Sequence[tuple[Callable[..., Any], int, tuple[Any, ...]]]  # what `call_with_index` takes
-TaskQueue = deque[tuple[Callable[..., Any], int, tuple[Any, ...]]]
+
+class Task(NamedTuple):
+    """A call, with its number among all: what `call_with_index` takes."""
+
+    function: Callable[..., Any]
+    number: int
+    arguments: tuple[Any, ...]
+
+
+class IndexedResult(NamedTuple):
+    """The number of a call, and what it returned."""
+
+    number: int
+    result: Any
+
+
+IndexedResults = Generator[IndexedResult, None, None]
+Tasks = Sequence[Task]
+TaskQueue = deque[Task]
 
 
 class WorkersLostError(CalibrationError):
@@ -54,9 +71,9 @@ class WorkersLostError(CalibrationError):
 
 def call_with_index(
     function: Callable[..., Any], index: int, arguments: tuple[Any, ...]
-) -> tuple[int, Any]:
-    """One call where it runs."""
-    return index, function(*arguments)
+) -> IndexedResult:
+    """Make a call, and return its number with its result."""
+    return IndexedResult(index, function(*arguments))
 
 
 def run_in_parallel(
@@ -78,15 +95,15 @@ def run_in_parallel(
     """
     if process_count == 0:
         raise OptionError("0 processes: give their number, or -1 for one a core")
-    waiting = deque((function, number, call) for number, call in enumerate(argument_tuples))
+    waiting = deque(Task(function, number, call) for number, call in enumerate(argument_tuples))
     needed = {__name__, function.__module__, *required_modules}
     clock = CallTimer()
     if scheduler_address and waiting:
         check_scheduler_answers(scheduler_address)
-        while waiting and clock.calls < MIN_TIMED_CALLS:
+        while waiting and clock.call_count < MIN_TIMED_CALLS:
             yield clock.run_and_time(waiting.popleft())
-        chunks = pop_chunks(waiting, clock.mean_seconds, MIN_CLUSTER_CHUNKS)
-        work = [(run_tasks, number, (chunk,)) for number, chunk in enumerate(chunks)]
+        chunks = pop_task_chunks(waiting, clock.mean_seconds, MIN_CLUSTER_CHUNKS)
+        work = [Task(run_tasks, number, (chunk,)) for number, chunk in enumerate(chunks)]
         if work:
             for _, found in run_on_cluster(work, scheduler_address, needed):
                 yield from found
@@ -97,37 +114,37 @@ def run_in_parallel(
             joblib = import_optional("joblib", "work in several processes", JOBLIB_REQUIREMENT)
             count = min(joblib.effective_n_jobs(process_count), len(waiting))
             if count > 1:
-                yield from run_in_processes(waiting, clock, count)
+                yield from run_in_processes_and_here(waiting, clock, count)
 
 
 class CallTimer:
     """Calls that are made here, and how long one takes."""
 
     def __init__(self) -> None:
-        self.calls = 0
-        self.all = 0.0
-        self.first = 0.0  # which also loads what it needs
+        self.call_count = 0
+        self.total_seconds = 0.0
+        self.first_call_seconds = 0.0  # which also loads what it needs
         self.threads = threadpoolctl.ThreadpoolController()
 
-    def run_and_time(
-        self, task: tuple[Callable[..., Any], int, tuple[Any, ...]]
-    ) -> tuple[int, Any]:
+    def run_and_time(self, task: Task) -> IndexedResult:
         """Make a call here, by one thread as everywhere else."""
         began = time.monotonic()
         with self.threads.limit(limits=1):
             out = call_with_index(*task)
         seconds = time.monotonic() - began
-        self.calls, self.all = self.calls + 1, self.all + seconds
-        self.first = self.first or seconds
+        self.call_count, self.total_seconds = self.call_count + 1, self.total_seconds + seconds
+        self.first_call_seconds = self.first_call_seconds or seconds
         return out
 
     @property
     def mean_seconds(self) -> float:
-        """Of a call, as far as is known: 0 before the second."""
-        return (self.all - self.first) / max(self.calls - 1, 1)
+        """Mean seconds of a call, the first one left out; 0 before the second."""
+        return (self.total_seconds - self.first_call_seconds) / max(self.call_count - 1, 1)
 
 
-def run_in_processes(task_queue: TaskQueue, timer: CallTimer, process_count: int) -> IndexedResults:
+def run_in_processes_and_here(
+    task_queue: TaskQueue, timer: CallTimer, process_count: int
+) -> IndexedResults:
     """Calls in count - 1 other processes and in this one, until all are done or at work."""
     loky = import_module("joblib.externals.loky")
     broken = import_module("joblib.externals.loky.process_executor").BrokenProcessPool
@@ -135,12 +152,12 @@ def run_in_processes(task_queue: TaskQueue, timer: CallTimer, process_count: int
     pack = import_module("joblib.externals.loky.backend.reduction").dumps
     pool = loky.get_reusable_executor(max_workers=process_count - 1, env=ONE_THREAD_ENVIRONMENT)
     REUSED_PROCESS_POOL[:] = [pool]
-    flying: set[Future[list[tuple[int, Any]]]] = set()
+    flying: set[Future[list[IndexedResult]]] = set()
     try:
         while task_queue or flying:
             while task_queue and len(flying) < CHUNKS_AHEAD_PER_PROCESS * (process_count - 1):
                 chunk = next(
-                    pop_chunks(
+                    pop_task_chunks(
                         task_queue, timer.mean_seconds, CHUNKS_PER_PROCESS_SHARE * process_count
                     )
                 )
@@ -163,9 +180,9 @@ def run_in_processes(task_queue: TaskQueue, timer: CallTimer, process_count: int
             future.cancel()
 
 
-def pop_chunks(
+def pop_task_chunks(
     task_queue: TaskQueue, seconds_per_call: float, share_count: int
-) -> Iterator[list[Any]]:
+) -> Iterator[list[Task]]:
     """Chunks of about `CHUNK_SECONDS` seconds, no larger than a share of what waits; they wait no
     more.
     """
@@ -176,12 +193,12 @@ def pop_chunks(
         yield [task_queue.popleft() for _ in range(max(size, 1))]
 
 
-def run_tasks(tasks: Tasks) -> list[tuple[int, Any]]:
+def run_tasks(tasks: Tasks) -> list[IndexedResult]:
     """Some calls where they run."""
     return [call_with_index(*each) for each in tasks]
 
 
-def run_pickled_tasks(pickled_tasks: bytes) -> list[tuple[int, Any]]:
+def run_pickled_tasks(pickled_tasks: bytes) -> list[IndexedResult]:
     """Calls from the process that shares them."""
     return run_tasks(pickle.loads(pickled_tasks))
 
@@ -220,7 +237,7 @@ def wait_for_results(client: Any, futures: Sequence[Any]) -> IndexedResults:
                 waiting, timeout=CLUSTER_POLL_SECONDS, return_when="FIRST_COMPLETED"
             ).done
         for future in done:
-            for result in fetch_result(future, distributed.TimeoutError):
+            for result in fetch_result_as_list(future, distributed.TimeoutError):
                 waiting.discard(future)
                 yield result
         if client.status == "running" and client.scheduler_info()["workers"]:
@@ -232,7 +249,7 @@ def wait_for_results(client: Any, futures: Sequence[Any]) -> IndexedResults:
             )
 
 
-def fetch_result(future: Any, timeout_error_type: type[Exception]) -> list[tuple[int, Any]]:
+def fetch_result_as_list(future: Any, timeout_error_type: type[Exception]) -> list[IndexedResult]:
     """The result of a call that is done, or nothing where its worker left before it was fetched.
 
     Dask makes such a call again elsewhere, but a client that asked already waits for ever.  Raises

@@ -43,7 +43,9 @@ def build_counted_stage(kind: str, part: int, parts: int, extra_text: str = "") 
     return ProgressStage(f"{kind} {part} of {parts}{extra_text}", kind, part, parts)
 
 
-def begin_numbered_step(progress: Progress, step: int, step_count: int, step_name: str) -> Progress:
+def announce_step_and_number_stages(
+    progress: Progress, step: int, step_count: int, step_name: str
+) -> Progress:
     """Begin a step of long work, as "Step 2 of 5: effects"; stages within it have its number."""
     head = f"Step {step} of {step_count}: "
 
@@ -55,7 +57,7 @@ def begin_numbered_step(progress: Progress, step: int, step_count: int, step_nam
     return numbered
 
 
-def build_budget_step_stage(step_name: str, rms_mm: float) -> ProgressStage:
+def build_finished_budget_step_stage(step_name: str, rms_mm: float) -> ProgressStage:
     """A step of an error budget that is done, with its held-out error [mm]."""
     return ProgressStage(f"{step_name}: {rms_mm:.3f} mm", rung=step_name, rms_mm=rms_mm)
 

@@ -51,7 +51,7 @@ LengthInMillimetres = InMillimetres[float]
 class DerivedField(cached_property[Value]):
     """A property that is a fact too: written and shown, not read, for other facts determine it."""
 
-    fact: FieldFormat
+    field_format: FieldFormat
 
 
 def derived_field(
@@ -61,7 +61,7 @@ def derived_field(
 
     def made(worked_out: Callable[[Any], Value]) -> DerivedField[Value]:
         found = DerivedField(worked_out)
-        found.fact = FieldFormat(text_format, **format_options)
+        found.field_format = FieldFormat(text_format, **format_options)
         return found
 
     return made
@@ -70,13 +70,13 @@ def derived_field(
 class LazyValue(Generic[Value]):
     """A fact that is worked out when it is first asked for."""
 
-    def __init__(self, made: Callable[[], Value]) -> None:
-        self.made = made
+    def __init__(self, compute: Callable[[], Value]) -> None:
+        self.compute = compute
 
     @cached_property
     def value(self) -> Value:
         """The fact."""
-        return self.made()
+        return self.compute()
 
 
 @cache
@@ -104,7 +104,10 @@ def derived_field_formats(record_type: type) -> Mapping[str, FieldFormat]:
     """Of the properties of a class that are facts, those of its bases first."""
     every = [vars(base).items() for base in reversed(record_type.__mro__)]
     return {
-        name: each.fact for own in every for name, each in own if isinstance(each, DerivedField)
+        name: each.field_format
+        for own in every
+        for name, each in own
+        if isinstance(each, DerivedField)
     }
 
 

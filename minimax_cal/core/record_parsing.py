@@ -1,7 +1,7 @@
 """Records of files: frozen dataclasses read, and described to other programs, by their annotations.
 
-What writes them is `files.to_plain_json`.  A class with `to_dict` and `from_dict(content, source)`
-stands in a file in its own way.
+What writes them is `files.convert_to_plain_json`.  A class with `to_dict` and `from_dict(content,
+source)` stands in a file in its own way.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from contextlib import contextmanager
 from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, NoReturn, TypeVar, Union, get_args, get_origin
 
 from minimax_cal.core.arrays import Array
-from minimax_cal.core.errors import CalibrationError, describe_error
-from minimax_cal.core.files import MAX_JSON_NUMBER, array_from_json, to_plain_json
+from minimax_cal.core.errors import CalibrationError, describe_file_content_error
+from minimax_cal.core.files import MAX_JSON_NUMBER, array_from_json, convert_to_plain_json
 from minimax_cal.core.record_fields import (
     FieldFormat,
     LazyValue,
@@ -136,7 +136,7 @@ def parse_as_type(annotation: Any, value: Any, field_format: FieldFormat, locati
     raise TypeError(f"{location}: no file holds a {annotation}")
 
 
-def raise_wrong_kind(location: str, expected_kind: str) -> Any:
+def raise_wrong_kind(location: str, expected_kind: str) -> NoReturn:
     """Raise ValueError for a value of another kind."""
     raise ValueError(f"{location}: should be {expected_kind}")
 
@@ -209,27 +209,28 @@ def parse_array(value: Any, location: str) -> Array:
 
 
 @contextmanager
-def convert_read_errors(source: str, part: str = "") -> Iterator[None]:
+def raise_read_errors_as_calibration_error(source: str, part: str = "") -> Iterator[None]:
     """Turns what goes wrong while a file, or a part of it, is used into one line for people."""
     try:
         yield
     except FILE_CONTENT_ERRORS as error:
         what = f"its {part} " if part else ""
         raise CalibrationError(
-            f"{source}: {what}cannot be read ({describe_error(error)}); {WRITE_AGAIN_ADVICE}"
+            f"{source}: {what}cannot be read ({describe_file_content_error(error)}); "
+            f"{WRITE_AGAIN_ADVICE}"
         ) from error
 
 
-def check_schema_version(content: Mapping[str, Any], source: str, known_version: int) -> None:
+def check_schema_version(content: Mapping[str, Any], source: str, supported_version: int) -> None:
     """Raise CalibrationError for a file of another version."""
     if "schema" not in content:
         raise CalibrationError(
             f"{source}: does not say of which schema it is; {WRITE_AGAIN_ADVICE}"
         )
-    if content["schema"] != known_version:
+    if content["schema"] != supported_version:
         raise CalibrationError(
             f"{source}: is of schema {content['schema']!r}, this version "
-            f"knows {known_version}; {WRITE_AGAIN_ADVICE} of "
+            f"knows {supported_version}; {WRITE_AGAIN_ADVICE} of "
             "this version"
         )
 
@@ -243,7 +244,7 @@ def build_json_schema(result_type: Any) -> dict[str, Any]:
     whole = (
         build_record_schema(result_type)
         if known
-        else to_plain_json(result_type.model_json_schema())
+        else convert_to_plain_json(result_type.model_json_schema())
     )
     title = f"Result of minimax-cal {result_type.COMMAND}" if known else "Robot file of minimax-cal"
     if known:
@@ -320,7 +321,7 @@ def build_type_schema(annotation: Any, field_format: FieldFormat) -> dict[str, A
         }
         return {"type": "object", "properties": parts, "required": list(parts)}
     return (
-        {"enum": [to_plain_json(one.value) for one in annotation]}
+        {"enum": [convert_to_plain_json(one.value) for one in annotation]}
         if isinstance(annotation, type(Enum))
         else {}
     )

@@ -10,17 +10,17 @@ from typing import Any, ClassVar, Self
 
 from minimax_cal.core.errors import CalibrationError
 from minimax_cal.core.files import (
+    convert_to_plain_json,
     format_json,
-    read_saved_json,
-    to_plain_json,
+    read_saved_result_json,
     write_file_atomically,
 )
 from minimax_cal.core.record_fields import record_to_file_values
 from minimax_cal.core.record_parsing import (
     WRITE_AGAIN_ADVICE,
     check_schema_version,
-    convert_read_errors,
     parse_record_fields,
+    raise_read_errors_as_calibration_error,
 )
 from minimax_cal.core.tables import Table
 
@@ -30,7 +30,7 @@ class JsonRecord:
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
-        return dict(to_plain_json(record_to_file_values(self)))
+        return dict(convert_to_plain_json(record_to_file_values(self)))
 
 
 class Result:
@@ -83,8 +83,8 @@ class Result:
         """
         named = {"schema": self.SCHEMA, "kind": self.KIND}
         return merge_nested_mappings(
-            merge_nested_mappings(named, to_plain_json(record_to_file_values(self))),
-            to_plain_json(self.extra_file_content(with_measurements=poses)),
+            merge_nested_mappings(named, convert_to_plain_json(record_to_file_values(self))),
+            convert_to_plain_json(self.extra_file_content(with_measurements=poses)),
         )
 
     @classmethod
@@ -96,7 +96,7 @@ class Result:
             raise CalibrationError(
                 f"{source}: is no {cls.KIND}; {WRITE_AGAIN_ADVICE} {cls.COMMAND}".rstrip()
             )
-        with convert_read_errors(source):
+        with raise_read_errors_as_calibration_error(source):
             told = parse_record_fields(cls, content)
             return cls(**{**told, **cls.parse_extra_fields(content, told, source)})
 
@@ -104,7 +104,7 @@ class Result:
     def load(cls, path: Self | Path | str) -> Self:
         """From its file; a result stays as it is.  Raises CalibrationError."""
         if isinstance(path, Path | str):
-            return cls.from_dict(read_saved_json(path), str(path))
+            return cls.from_dict(read_saved_result_json(path), str(path))
         return path
 
     def json(self, *, poses: bool = True) -> str:

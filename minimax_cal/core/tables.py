@@ -9,14 +9,14 @@ import textwrap
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from html import escape
-from typing import Any, Literal, cast
+from typing import Any, Literal, NamedTuple, cast
 
 from rich import box
 from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from minimax_cal.core.display_text import replace_control_characters
+from minimax_cal.core.display_text import replace_invisible_and_bidi_characters
 from minimax_cal.core.files import format_csv
 from minimax_cal.core.record_fields import all_field_formats, scale_numbers
 
@@ -40,6 +40,15 @@ LATEX_ESCAPES = str.maketrans(
     {c: "\\" + c for c in "&%$#_{}"}
     | {"~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}"}
 )
+
+
+class ColumnWidth(NamedTuple):
+    """Widths of a column in letters: the least that breaks no number, unit or name, and the usual
+    one.
+    """
+
+    minimum: int
+    usual: int
 
 
 @dataclass(frozen=True)
@@ -108,7 +117,7 @@ class Table:
             for row in self.rows
         ]
 
-    def numeric_column_flags(self) -> list[bool]:
+    def is_numeric_by_column(self) -> list[bool]:
         """Which columns hold numbers (and are aligned right)."""
         return [
             any(isinstance(row[i], int | float) for row in self.rows)
@@ -144,18 +153,21 @@ class Table:
             here.append(i)
         console.print(self.select_columns(*here).to_rich_table(room))
 
-    def column_widths(self) -> list[tuple[int, int]]:
-        """Of each column, the least that breaks no number, unit or name, and the usual one."""
+    def column_widths(self) -> list[ColumnWidth]:
+        """The widths of each column."""
         rows, out = self.formatted_cells(), []
         for i, (name, right) in enumerate(
-            zip(self.header, self.numeric_column_flags(), strict=True)
+            zip(self.header, self.is_numeric_by_column(), strict=True)
         ):
-            cells = [replace_control_characters(row[i]) for row in rows]
+            cells = [replace_invisible_and_bidi_characters(row[i]) for row in rows]
             parts = [
                 part for cell in cells for part in split_unbreakable_parts(cell, is_number=right)
             ]
-            least = max(map(len, [*parts, *replace_control_characters(name).split()]), default=1)
-            out.append((least, max(map(len, [*cells, replace_control_characters(name)]))))
+            least = max(
+                map(len, [*parts, *replace_invisible_and_bidi_characters(name).split()]), default=1
+            )
+            usual = max(map(len, [*cells, replace_invisible_and_bidi_characters(name)]))
+            out.append(ColumnWidth(least, usual))
         return out
 
     def to_rich_table(self, max_width: int = 0) -> RichTable:
@@ -163,7 +175,7 @@ class Table:
         few.
         """
         table = RichTable(
-            title=Text(replace_control_characters(self.title)),
+            title=Text(replace_invisible_and_bidi_characters(self.title)),
             title_justify="left",
             header_style="bold",
             box=box.SIMPLE,
@@ -174,11 +186,11 @@ class Table:
             i = max(range(len(widths)), key=lambda i: widths[i] - least[i])
             widths[i], over = widths[i] - 1, over - 1
         for name, right, width in zip(
-            self.header, self.numeric_column_flags(), widths, strict=True
+            self.header, self.is_numeric_by_column(), widths, strict=True
         ):
             justify: Literal["left", "right"] = "right" if right else "left"
             table.add_column(
-                Text(replace_control_characters(name)),
+                Text(replace_invisible_and_bidi_characters(name)),
                 justify=justify,
                 overflow="fold",
                 width=width,
@@ -186,7 +198,7 @@ class Table:
         for row in self.formatted_cells():
             table.add_row(
                 *(
-                    Text(wrap_cell(replace_control_characters(c), n))
+                    Text(wrap_cell(replace_invisible_and_bidi_characters(c), n))
                     for c, n in zip(row, widths, strict=True)
                 )
             )
@@ -194,7 +206,7 @@ class Table:
 
     def markdown(self) -> str:
         """A pipe table under its title."""
-        rule = ["---:" if right else "---" for right in self.numeric_column_flags()]
+        rule = ["---:" if right else "---" for right in self.is_numeric_by_column()]
         lines = [list(self.header), rule, *self.formatted_cells()]
         body = "\n".join(
             "| " + " | ".join(c.replace("|", "\\|") for c in row) + " |" for row in lines
@@ -203,7 +215,7 @@ class Table:
 
     def html(self) -> str:
         """A table with its title as caption; the first cell of a row is its header."""
-        classes = [' class="right"' if right else "" for right in self.numeric_column_flags()]
+        classes = [' class="right"' if right else "" for right in self.is_numeric_by_column()]
 
         def is_short(tag: str, cell: str) -> bool:
             return tag == "td" and len(cell) <= MAX_NOWRAP_CELL_LETTERS
@@ -234,7 +246,7 @@ class Table:
 
     def latex(self) -> str:
         """A booktabs tabular with the title as caption."""
-        align = "".join("r" if right else "l" for right in self.numeric_column_flags())
+        align = "".join("r" if right else "l" for right in self.is_numeric_by_column())
         header, *body = [
             " & ".join(cell.translate(LATEX_ESCAPES) for cell in row) + r" \\"
             for row in (list(self.header), *self.formatted_cells())

@@ -10,7 +10,7 @@ from threadpoolctl import ThreadpoolController
 
 
 @cache
-def find_blas_libraries() -> ThreadpoolController:
+def get_blas_thread_controller() -> ThreadpoolController:
     """Those of linear algebra that are loaded: looked for once, which takes 6 ms."""
     return ThreadpoolController()
 
@@ -18,5 +18,5 @@ def find_blas_libraries() -> ThreadpoolController:
 @contextmanager
 def limit_blas_to_one_thread() -> Iterator[None]:
     """Linear algebra by one thread, within a block or, as a decorator, a function."""
-    with find_blas_libraries().limit(limits=1, user_api="blas"):
+    with get_blas_thread_controller().limit(limits=1, user_api="blas"):
         yield

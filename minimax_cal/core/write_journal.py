@@ -8,13 +8,20 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
+from typing import NamedTuple
 
 MAX_HIDDEN_STEM_LETTERS = 40  # letters of a name that stand in that of its temporary neighbour
 
-# Of each file that was written since `undo_writes_on_error` began: its path, a hidden link to the
-# file
-# before it, and whether there was one.
-WriteJournal = list[tuple[Path, Path, bool]]
+
+class JournalEntry(NamedTuple):
+    """A file that was written: its path, a hidden link to the file before it, if there was one."""
+
+    path: Path
+    backup_path: Path
+    had_file: bool
+
+
+WriteJournal = list[JournalEntry]  # since `undo_writes_on_error` began
 WRITE_JOURNAL: ContextVar[WriteJournal | None] = ContextVar("JOURNAL", default=None)
 
 
@@ -55,13 +62,13 @@ def remove_backup_files(journal: WriteJournal) -> None:
             old.unlink(missing_ok=True)
 
 
-def back_up_before_write(path: Path) -> None:
+def link_backup_in_journal(path: Path) -> None:
     """Keep the file at a path by another link, for `undo_writes_on_error` to put it back."""
     journal = WRITE_JOURNAL.get()
     if journal is None:
         return
-    old, existed = unused_hidden_path(path), path.exists()
-    journal.append((path, old, existed))
+    old, existed = unused_hidden_path_in_folder_of(path), path.exists()
+    journal.append(JournalEntry(path, old, existed))
     if existed:
         try:
             os.link(path, old)
@@ -69,6 +76,6 @@ def back_up_before_write(path: Path) -> None:
             shutil.copy2(path, old)
 
 
-def unused_hidden_path(path: Path) -> Path:
+def unused_hidden_path_in_folder_of(path: Path) -> Path:
     """A name in the folder of a path that no other file has."""
     return path.with_name(f".{path.name[:MAX_HIDDEN_STEM_LETTERS]}.{os.urandom(4).hex()}")

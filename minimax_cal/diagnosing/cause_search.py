@@ -30,7 +30,7 @@ from minimax_cal.measuring.faults import faults_with_file_lines
 from minimax_cal.measuring.faults.data_fault import DataFault
 from minimax_cal.measuring.faults.read_back_joints import find_lag_in_point_errors
 from minimax_cal.measuring.pose_groups import cluster_poses
-from minimax_cal.modelling.arm_laws import build_arm_library
+from minimax_cal.modelling.arm_laws import build_library_of_testable_arm_laws
 from minimax_cal.modelling.effects.scene import PosedArm
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.modelling.effects.time_effects import SESSION_JUMP
@@ -261,7 +261,7 @@ def select_arm_effects(
     """Effects of the library that explain a study's errors.  previous_fits: selected with other
     weights.
     """
-    lib = build_arm_library(study.scene, study.rows, excluded_effects)
+    lib = build_library_of_testable_arm_laws(study.scene, study.rows, excluded_effects)
     if SESSION_JUMP.name not in excluded_effects:
         lib = add_session_jumps(lib, study)
     return forward_selection.select_effects_by_evidence(lib, previous_fits=previous_fits)

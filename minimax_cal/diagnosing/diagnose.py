@@ -16,11 +16,14 @@ from minimax_cal.core.arrays import Array
 from minimax_cal.core.display_text import format_first_names
 from minimax_cal.core.errors import DataError
 from minimax_cal.core.option_fields import (
-    check_excluded_effects,
+    check_excluded_effects_are_known,
     option_field_in_group,
     take_option_fields_as_keywords,
 )
-from minimax_cal.core.progress_stages import begin_numbered_step, build_budget_step_stage
+from minimax_cal.core.progress_stages import (
+    announce_step_and_number_stages,
+    build_finished_budget_step_stage,
+)
 from minimax_cal.core.threads import limit_blas_to_one_thread
 from minimax_cal.diagnosing.budget_steps import (
     MENDED_FAULT_NAMES,
@@ -142,7 +145,9 @@ class DiagnosisOptions:
     def number_stage(self, progress: Progress, stage_name: str) -> Progress:
         """Progress of one of STEPS."""
         steps = [step for step in DIAGNOSIS_STAGES if not (self.quick and step == REGIONS_STAGE)]
-        return begin_numbered_step(progress, steps.index(stage_name) + 1, len(steps), stage_name)
+        return announce_step_and_number_stages(
+            progress, steps.index(stage_name) + 1, len(steps), stage_name
+        )
 
 
 OTHER_INSTRUMENT_OPTIONS = ("offset", "known_distances", "lever", "noises", *CameraImages.options)
@@ -236,7 +241,7 @@ def diagnose(
         chosen = merge_instrument_options(given, replace(options, exclude=()), others)
         return diagnose_with_options(robot, given, options.exclude, chosen, progress)
     check_no_instrument_options(given, others)
-    check_excluded_effects(options.exclude, EFFECTS)
+    check_excluded_effects_are_known(options.exclude, EFFECTS)
     given = measurement_checks.check_and_complete_joints(robot, given)
     measurement_checks.check_point_spread(robot, given)
     raw = add_group_column(add_history_columns(with_u95_of_instrument(given, options.instrument)))
@@ -316,7 +321,7 @@ def diagnose_checked_measurements(
         spoilt = measurements.take(~np.isin(measurements.line, held_lines))
     steps = judge_budget_steps(study, last, spoken, ladder, spoilt)
     for one in steps:
-        progress(build_budget_step_stage(format_budget_step(one.name), one.holdout.rms_mm))
+        progress(build_finished_budget_step_stage(format_budget_step(one.name), one.holdout.rms_mm))
     count = len(steps) - len(ladder.taken_numbers) + ladder.confirmed_count
     step = steps[count - 1]
     judge = step.trusted if step.trusted.poses else step.train

@@ -12,7 +12,10 @@ from scipy.special import chdtri
 
 from minimax_cal.core.arrays import Array
 from minimax_cal.core.errors import DataError, OptionError
-from minimax_cal.core.option_fields import check_excluded_effects, take_option_fields_as_keywords
+from minimax_cal.core.option_fields import (
+    check_excluded_effects_are_known,
+    take_option_fields_as_keywords,
+)
 from minimax_cal.core.threads import limit_blas_to_one_thread
 from minimax_cal.diagnosing.budget_steps import max_motion_per_unit as motions_of
 from minimax_cal.diagnosing.cause_search import FoundCauses, judge_causes
@@ -50,7 +53,7 @@ from minimax_cal.fitting.multi_instrument.relative_result import RelativeCalibra
 from minimax_cal.fitting.robust_fit import SQUARE_LOSS
 from minimax_cal.instruments.instrument import METRE_UNIT
 from minimax_cal.instruments.instrument_files import InstrumentInput
-from minimax_cal.modelling.arm_laws import build_arm_library
+from minimax_cal.modelling.arm_laws import build_library_of_testable_arm_laws
 from minimax_cal.modelling.effects.scene import PosedArm
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.robots.robot import Robot
@@ -119,7 +122,7 @@ def diagnose_with_options(
 ) -> RelativeDiagnosis:
     """`diagnose_relative`, which calls this, with its options in one."""
     began = time.perf_counter()
-    check_excluded_effects(excluded_effects, EFFECTS)
+    check_excluded_effects_are_known(excluded_effects, EFFECTS)
     if options.effects:
         raise OptionError("effects: a diagnosis looks for them; leave them out")
     if options.loss != SQUARE_LOSS:
@@ -172,7 +175,7 @@ def search_shared_causes(
     left_out = (*excluded_effects, *lacking)
     scene = build_common_arm_state(request.robot, fit)
     rows = build_instrument_rows(scene, fit)
-    choice = select_effects_by_evidence(build_arm_library(scene, rows, left_out))
+    choice = select_effects_by_evidence(build_library_of_testable_arm_laws(scene, rows, left_out))
     if choice.candidate_fits and len(fit.training_data) > 1:
         bent = request.with_effects([one.term for one in choice.candidates]).fit_training_data(
             silent_progress
@@ -180,7 +183,8 @@ def search_shared_causes(
         stack = replace(fit.stack, precision=bent.stack.precision)
         rows = build_instrument_rows(scene, replace(fit, problem=replace(fit.problem, stack=stack)))
         choice = select_effects_by_evidence(
-            build_arm_library(scene, rows, left_out), previous_fits=choice.candidate_fits
+            build_library_of_testable_arm_laws(scene, rows, left_out),
+            previous_fits=choice.candidate_fits,
         )
     left: tuple[RemainingComponent, ...] = (NO_REMAINING_COMPONENT,)
     if choice.noise.variance >= rows.rounding_noise**2:

@@ -13,7 +13,7 @@ from typing import Annotated
 import numpy as np
 
 from minimax_cal.core.arrays import Array, rms
-from minimax_cal.core.files import to_plain_json
+from minimax_cal.core.files import convert_to_plain_json
 from minimax_cal.core.record_fields import (
     FieldFormat,
     InMillimetres,
@@ -124,7 +124,7 @@ class ErrorLocations:
              **vars(one.what)}
             for one in self.by_joint
         ]  # fmt: skip
-        return dict(to_plain_json(told))
+        return dict(convert_to_plain_json(told))
 
 
 def locate_errors(study: LinearisedGeometry) -> ErrorLocations:

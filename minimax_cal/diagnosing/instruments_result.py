@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any
 
-from minimax_cal.core.files import float_from_json, to_plain_json
+from minimax_cal.core.files import convert_to_plain_json, float_from_json
 from minimax_cal.core.record_fields import (
     SEPARATE_FIELD_FORMAT,
     FieldFormat,
@@ -14,7 +14,10 @@ from minimax_cal.core.record_fields import (
     record_to_file_values,
     round_to_15_digits,
 )
-from minimax_cal.core.record_parsing import convert_read_errors, parse_record_fields
+from minimax_cal.core.record_parsing import (
+    parse_record_fields,
+    raise_read_errors_as_calibration_error,
+)
 from minimax_cal.core.results import Result, merge_nested_mappings
 from minimax_cal.core.tables import Table, drop_empty_tables
 from minimax_cal.core.units import display_unit_of_change, file_unit
@@ -191,7 +194,9 @@ class RelativeDiagnosis(Explanation, Result):
                 for kind, ends in summarise_first_and_last_steps(self.steps).items()
             },
         }
-        own = merge_nested_mappings(to_plain_json(record_to_file_values(self)), to_plain_json(more))
+        own = merge_nested_mappings(
+            convert_to_plain_json(record_to_file_values(self)), convert_to_plain_json(more)
+        )
         return {**self.calibration.to_dict(), "diagnosis": own}
 
     @classmethod
@@ -199,7 +204,7 @@ class RelativeDiagnosis(Explanation, Result):
         """From `to_dict`.  Raises CalibrationError."""
         calibration = RelativeCalibration.from_dict(content, source)
         terms = calibration.cell.effects.terms if calibration.cell else ()
-        with convert_read_errors(source, "diagnosis"):
+        with raise_read_errors_as_calibration_error(source, "diagnosis"):
             own = content["diagnosis"]
             told, floor = parse_record_fields(cls, own), own["floor"]
             end, scale = ("", 1.0) if "unit" in floor else ("_mm", 1e-3)

@@ -21,7 +21,7 @@ from functools import cached_property
 import numpy as np
 
 from minimax_cal.core.arrays import Array
-from minimax_cal.core.linear_algebra import scale_symmetric
+from minimax_cal.core.linear_algebra import divide_by_scales
 from minimax_cal.diagnosing.diagnosis import Finding
 from minimax_cal.diagnosing.study import LinearisedGeometry
 from minimax_cal.fitting.region_holdout import are_regions_needed, step_without_poses
@@ -80,7 +80,7 @@ def fit_prior_weights(
     across = solve_normal_equations(gram[:p, :p], gram[:p, p:])
     left = gram[p:, p:] - gram[p:, :p] @ across  # what geometry leaves of the effects
     size = np.sqrt(np.diag(gram)[p:])  # how far a unit moves all points
-    left = scale_symmetric(left, size)
+    left = divide_by_scales(left, size)
     told = (pull[p:] - across.T @ pull[:p]) / size + left @ (values * size)
     square = float((linearisation.error**2).sum())
     least = square - float(pull @ solve_normal_equations(gram, pull[:, None])[:, 0])

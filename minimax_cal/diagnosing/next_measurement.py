@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from minimax_cal.core.arrays import Array
-from minimax_cal.core.linear_algebra import column_scales, schur_complement
+from minimax_cal.core.linear_algebra import column_norms_from_gram, schur_complement
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.effects.scene import PosedArm
 from minimax_cal.modelling.effects.table import (
@@ -493,7 +493,7 @@ def separation_powers(
             whole = np.concatenate([half[:, :p] @ span, half[:, p:]], axis=1)
             # What remains of the effect's motion once the rival has imitated it.
             left = schur_complement(whole, span.shape[1] + count, FITTED_COLUMN_RIDGE)
-            scale = 1.0 / column_scales(left[1:, 1:])
+            scale = 1.0 / column_norms_from_gram(left[1:, 1:])
             unit = left[1:, 1:] * scale * scale[:, None]
             inverse = np.linalg.pinv(unit, 1e-9, hermitian=True)
             across = left[0, 1:] * scale

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from minimax_cal.core.arrays import Array
-from minimax_cal.core.files import to_plain_json
+from minimax_cal.core.files import convert_to_plain_json
 from minimax_cal.core.record_parsing import parse_array
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.visit_history import (
@@ -46,9 +46,9 @@ class ResidualCurve:
         views = zip(RESIDUAL_VIEW_NAMES, self.y, strict=False)
         return {
             "title": self.title,
-            "x": {"label": self.xlabel, "values": to_plain_json(self.x)},
+            "x": {"label": self.xlabel, "values": convert_to_plain_json(self.x)},
             "y": {"label": self.ylabel},
-            "views": [{"name": name, "values": to_plain_json(y)} for name, y in views],
+            "views": [{"name": name, "values": convert_to_plain_json(y)} for name, y in views],
         }
 
     @staticmethod

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
@@ -58,6 +58,13 @@ GIVEN_STEP_NAME, REFITTED_STEP_NAME, USUAL_FRICTION_STEP_NAME = (
 )
 MAX_HELD_OUT_ROWS = 750  # of the held-out run that is drawn
 FRICTION_CURVE_POINT_COUNT = 61  # of a friction curve
+
+
+class NonzeroColumns(NamedTuple):
+    """Columns (q,) that add to the rows of a joint, and these rows (R, q)."""
+
+    column_indices: Array
+    rows: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,11 +146,11 @@ class CrossValidation:
         return self.row_fold >= 0
 
     @cached_property
-    def nonzero_columns_by_joint(self) -> list[tuple[Array, Array]]:
+    def nonzero_columns_by_joint(self) -> list[NonzeroColumns]:
         """Of each joint the columns (q,) that add to its rows, and these rows (R, q)."""
         each = [np.flatnonzero(rows.any(axis=0)) for rows in self.regression.unwhitened_design]
         return [
-            (used, rows[:, used])
+            NonzeroColumns(used, rows[:, used])
             for used, rows in zip(each, self.regression.unwhitened_design, strict=True)
         ]
 
@@ -172,7 +179,8 @@ class CrossValidation:
         out besides.
         """
         index = np.setdiff1d(
-            self.regression.find_columns(column_groups), np.array(excluded_columns, dtype=int)
+            self.regression.column_indices_of_groups(column_groups),
+            np.array(excluded_columns, dtype=int),
         )
         torque = (
             self.regression.columns.torques_to_explain
@@ -260,7 +268,7 @@ class CrossValidation:
             ),
         )
 
-    def build_error_budget(self, removed_delay: float) -> tuple[MotionStep, ...]:
+    def list_heldout_rms_by_step(self, removed_delay: float) -> tuple[MotionStep, ...]:
         """Held-out RMS of each joint, from the model as given to all laws.
 
         The model as given has a gain of each joint where none is known.
@@ -332,7 +340,7 @@ class CrossValidation:
     def compute_friction_curves(self) -> Iterator[FrictionCurve]:
         """Friction over the speed of each joint, and its spread over fits without each fold."""
         normal, arm = self.regression, self.regression.columns.scene.arm
-        folds = self.solve_folds(normal.find_columns(normal.column_groups))
+        folds = self.solve_folds(normal.column_indices_of_groups(normal.column_groups))
         values = np.array([self.values, *folds])
         for j in range(arm.robot.joints):
             v = np.linspace(-1.0, 1.0, FRICTION_CURVE_POINT_COUNT) * arm.fastest[j]

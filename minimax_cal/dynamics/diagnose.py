@@ -11,7 +11,10 @@ import numpy as np
 from scipy.special import ndtr
 
 from minimax_cal.core.arrays import Array
-from minimax_cal.core.option_fields import check_excluded_effects, take_option_fields_as_keywords
+from minimax_cal.core.option_fields import (
+    check_excluded_effects_are_known,
+    take_option_fields_as_keywords,
+)
 from minimax_cal.core.progress_stages import Progress, silent_progress
 from minimax_cal.core.threads import limit_blas_to_one_thread
 from minimax_cal.dynamics.cross_validation import CrossValidation
@@ -117,7 +120,7 @@ def diagnose_motion(
     >>> print(mc.diagnose_motion("arm.urdf", ["run1.csv", "run2.csv"]).summary())
     """
     began = time.perf_counter()
-    check_excluded_effects(exclude, TORQUE_LAWS)
+    check_excluded_effects_are_known(exclude, TORQUE_LAWS)
     progress("reading logs")
     inputs = known.read_inputs(robot, logs)
     with limit_blas_to_one_thread():
@@ -194,7 +197,7 @@ def diagnose_torques(
         unit=logs.unit,
         verdict=find_verdict(effects, left, too_little),
         effects=effects,
-        budget=validation.build_error_budget(delay.value),
+        budget=validation.list_heldout_rms_by_step(delay.value),
         unexplained=left,
         not_testable=search.list_untestable_effects(),
         too_little=too_little,
@@ -365,7 +368,9 @@ def build_motion_effects(
     rigid = validation.compute_rms_by_joint(
         validation.compute_held_out_residuals([RIGID_BODY_GROUP]), logs.is_row_moving
     )
-    for number, column in enumerate(normal.find_columns([USUAL_FRICTION_GROUP]).tolist()):
+    for number, column in enumerate(
+        normal.column_indices_of_groups([USUAL_FRICTION_GROUP]).tolist()
+    ):
         z = value[column] / sigma[column] if sigma[column] > 0.0 else 0.0
         if float(ndtr(-z)) * 2 * logs.joint_count > FALSE_NAME_PROBABILITY:
             continue

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any, Literal, Self
+from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
 
@@ -284,7 +284,7 @@ def describe_lack_of_angle_range(scene: ArmMotion, joint_index: int) -> str:
 
 def describe_lack_of_slow_motion(scene: ArmMotion, joint_index: int) -> str:
     """Whether a joint moves slowly at times, away from reversals."""
-    rows = scene.logs.is_row_fitted[:, joint_index]
+    rows = scene.logs.fitted_row_mask_by_joint[:, joint_index]
     slow = (
         np.abs(LAW_QUANTITIES["v"](scene, joint_index)[scene.logs.row_samples][rows])
         < MAX_SLOW_SPEED_SHARE
@@ -321,7 +321,9 @@ def describe_lack_of_gear_ratio(scene: ArmMotion, joint_index: int) -> str:
         * abs(ratio)
         / (2.0 * np.pi)
     )
-    seen = np.count_nonzero((rate < FILTER_CUTOFF_HZ) & scene.logs.is_row_fitted[:, joint_index])
+    seen = np.count_nonzero(
+        (rate < FILTER_CUTOFF_HZ) & scene.logs.fitted_row_mask_by_joint[:, joint_index]
+    )
     return "" if seen >= 100 else "a run slow enough for the waves of the gear to pass the filter"
 
 
@@ -618,9 +620,14 @@ class TorqueTerm:
         return out
 
 
-def list_testable_terms(
-    scene: ArmMotion, excluded_effects: Sequence[str]
-) -> tuple[list[TorqueTerm], list[tuple[str, str, str]]]:
+class TestableTerms(NamedTuple):
+    """Laws at places that logs can test; (effect, place, what is needed) of the others."""
+
+    terms: list[TorqueTerm]
+    untestable: list[tuple[str, str, str]]
+
+
+def list_testable_terms(scene: ArmMotion, excluded_effects: Sequence[str]) -> TestableTerms:
     """Every law at every place that the logs can test; (effect, place, what is needed) if not."""
     found, lacking = list[TorqueTerm](), list[tuple[str, str, str]]()
     for effect, law in TORQUE_LAWS.items():
@@ -631,4 +638,4 @@ def list_testable_terms(
                 lacking.append((effect, place, needs))
                 continue
             found += [TorqueTerm(effect, place, c) for c in law.list_initial_tunings(scene, j)]
-    return found, lacking
+    return TestableTerms(found, lacking)

@@ -126,7 +126,7 @@ def compare_masses_with_nominal(regression: TorqueRegression) -> MassTest:
     )
     rows = regression.columns.link_parameter_columns
     links = regression.whitening.whiten_rows(rows[kept])
-    others = regression.find_columns(regression.column_groups[1:])
+    others = regression.column_indices_of_groups(regression.column_groups[1:])
     matrix = np.concatenate([regression.whitened_design[:, others], links], axis=1)
     error, count = (
         regression.whitened_torques - links @ arm.nominal_inertial_parameters,

@@ -7,6 +7,7 @@ both about the origin of its own frame, in that frame's axes [Atkeson, An, Holle
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -57,7 +58,16 @@ def compute_link_axes(link_frames: LinkFrames) -> Array:
     return np.stack([cross(link_frames.y, z), link_frames.y, z], axis=1)
 
 
-def compute_chain_motion(robot: Robot, motion: JointMotion) -> tuple[LinkFrames, Array]:
+class ChainMotion(NamedTuple):
+    """Link frames, and (3, n, 3, m) turning rate, its derivative and acceleration of each
+    origin.
+    """
+
+    link_frames: LinkFrames
+    rates: Array
+
+
+def compute_chain_motion(robot: Robot, motion: JointMotion) -> ChainMotion:
     """The chain that the drives move by the robot's couplings, and how: (3, n, 3, m) in the base.
 
     Turning rate, its derivative and acceleration of the origin of each link.  The base accelerates
@@ -80,7 +90,7 @@ def compute_chain_motion(robot: Robot, motion: JointMotion) -> tuple[LinkFrames,
         inward = cross(rate, cross(rate, arm))
         speeding = speeding + cross(change, arm) + inward + slide
         out[:, j] = rate, change, speeding
-    return links, out
+    return ChainMotion(links, out)
 
 
 def convert_chain_to_drive_torques(robot: Robot, chain_torques: Array) -> Array:
@@ -90,9 +100,16 @@ def convert_chain_to_drive_torques(robot: Robot, chain_torques: Array) -> Array:
     )
 
 
+class WrenchColumns(NamedTuple):
+    """Force and moment per inertial parameter, (3, 10, m) each."""
+
+    force: Array
+    moment: Array
+
+
 def compute_wrench_per_inertial_parameter(
     angular_velocity: Array, angular_acceleration: Array, origin_acceleration: Array
-) -> tuple[Array, Array]:
+) -> WrenchColumns:
     """Force and moment about a link's origin per inertial parameter: (3, 10, m) each.
 
     Arguments (3, m): turning rate, its derivative, acceleration of the origin, in the link's axes.
@@ -112,7 +129,7 @@ def compute_wrench_per_inertial_parameter(
         spin[i], turn[i] = angular_velocity[j], angular_acceleration[j]
         spin[j], turn[j] = angular_velocity[i], angular_acceleration[i]
         moment[:, 4 + number] = turn + cross(angular_velocity, spin)
-    return force, moment
+    return WrenchColumns(force, moment)
 
 
 def regressor(robot: Robot, motion: JointMotion) -> Array:

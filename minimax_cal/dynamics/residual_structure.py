@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import stdtr
@@ -185,7 +186,7 @@ def build_bumps_at_integers(scaled_driver_values: Array) -> list[Array]:
     return [np.exp(-((scaled_driver_values - k) ** 2)) for k in range(BUMP_COUNT + 1)]
 
 
-def build_angle_functions(inputs: DriverInputs) -> list[Array]:
+def build_own_angle_probes(inputs: DriverInputs) -> list[Array]:
     """The joint's own angle, alone and with the direction."""
     q = inputs.q[:, inputs.joint_index]
     if inputs.scene.arm.robot.prismatic[inputs.joint_index]:
@@ -324,7 +325,7 @@ def build_motion_history_functions(inputs: DriverInputs) -> list[Array]:
 
 
 RESIDUAL_DRIVERS: dict[str, Callable[[DriverInputs], list[Array]]] = {
-    "angle": build_angle_functions,
+    "angle": build_own_angle_probes,
     "fine waves of the angle": build_fine_angle_wave_functions,
     "speed": build_speed_functions,
     "direction": build_direction_functions,
@@ -369,7 +370,7 @@ def find_unexplained_torques(regression: TorqueRegression, values: Array) -> lis
                     scene.logs.since[moments.sample_indices] / TIME_FOLD_STRETCH_DURATION
                 ).astype(int) % TIME_FOLD_COUNT
             raw = np.stack(columns(moments), axis=1)
-            share, p = compute_predicted_square_share(
+            share, p = predicted_share_and_p_value(
                 project_out_model_and_normalise(basis, raw), left, fold, group
             )
             p = min(1.0, p * len(RESIDUAL_DRIVERS) * scene.logs.joint_count)
@@ -387,9 +388,16 @@ def project_out_model_and_normalise(model_basis: Array, probe_columns: Array) ->
     return np.asarray(field / np.maximum(size, least))
 
 
-def compute_predicted_square_share(
+class PredictedShare(NamedTuple):
+    """Share of a squared error that a probe predicts in folds left out, and its p-value."""
+
+    share: float
+    p_value: float
+
+
+def predicted_share_and_p_value(
     probe_columns: Array, residuals: Array, row_folds: Array, row_groups: Array
-) -> tuple[float, float]:
+) -> PredictedShare:
     """Share of the square of the remaining error that a probe foretells in folds left out, p-value.
 
     The ridge is that of a probe that explains a part of the error, the part that foretells best.
@@ -417,4 +425,4 @@ def compute_predicted_square_share(
             count = len(gain)
             unsure = float(gain.std(ddof=1)) / np.sqrt(count) if count > 1 else np.inf
             found = share, float(stdtr(count - 1, -float(gain.mean()) / max(unsure, 1e-12)))
-    return found
+    return PredictedShare(*found)

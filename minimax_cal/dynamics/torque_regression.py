@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -38,6 +39,13 @@ MIN_SIGN_CHANGE_GAIN = (
 RIGID_BODY_GROUP, USUAL_FRICTION_GROUP = "rigid", "usual"  # parts of a fit beside the laws
 
 
+class TermRows(NamedTuple):
+    """The joints (k,) whose rows a law adds to, and what it adds (k, R, d)."""
+
+    joint_indices: Array
+    rows: Array
+
+
 @dataclass(frozen=True, eq=False)
 class TorqueColumns:
     """Filtered columns of a scene, each law's computed once.
@@ -46,9 +54,9 @@ class TorqueColumns:
     """
 
     scene: ArmMotion
-    rows_by_term: dict[str, tuple[Array, Array]] = field(default_factory=dict)
+    rows_by_term: dict[str, TermRows] = field(default_factory=dict)
 
-    def build_term_rows(self, term: TorqueTerm) -> tuple[Array, Array]:
+    def build_term_rows(self, term: TorqueTerm) -> TermRows:
         """The joints (k,) whose rows a law adds to, and what it adds (k, R, d)."""
         if term.text not in self.rows_by_term:
             rows = self.scene.logs.filter_to_rows(term.build_columns(self.scene))
@@ -56,7 +64,8 @@ class TorqueColumns:
             joints = (
                 np.arange(self.scene.logs.joint_count) if whole else np.array([term.joint_index])
             )
-            self.rows_by_term[term.text] = joints, np.moveaxis(rows, 1, 0) if whole else rows[None]
+            by_joint = np.moveaxis(rows, 1, 0) if whole else rows[None]
+            self.rows_by_term[term.text] = TermRows(joints, by_joint)
         return self.rows_by_term[term.text]
 
     @cached_property
@@ -112,7 +121,7 @@ class TorqueColumns:
         arm, logs = self.scene.arm, self.scene.logs
         soft, design = arm.soft.copy(), self.build_design_matrix(terms)
         for j in range(logs.joint_count):
-            rows, qd = logs.is_row_fitted[:, j], logs.motion.qd[:, j, None]
+            rows, qd = logs.fitted_row_mask_by_joint[:, j], logs.motion.qd[:, j, None]
             beside = design[j, rows]
             if np.count_nonzero(rows) < 2 * beside.shape[1]:
                 continue
@@ -137,7 +146,7 @@ class TorqueColumns:
 
     def estimate_whitening(self, terms: Sequence[TorqueTerm]) -> AutoregressiveWhitening:
         """By what a fit of one variant of every law leaves: noise, were one of them true."""
-        kept = self.scene.logs.is_row_fitted.T
+        kept = self.scene.logs.fitted_row_mask_by_joint.T
         matrix, error = (
             self.build_design_matrix_of_one_variant_each(terms)[kept],
             self.torques_to_explain[kept],
@@ -281,7 +290,7 @@ class FittedBody:
     @staticmethod
     def fit_with_friction(scene: ArmMotion) -> FittedBody:
         """Rigid body and usual friction by plain least squares on the rows that are fitted."""
-        columns, kept = TorqueColumns(scene), scene.logs.is_row_fitted.T
+        columns, kept = TorqueColumns(scene), scene.logs.fitted_row_mask_by_joint.T
         value = solve_ridge_least_squares(
             columns.build_design_matrix()[kept], columns.torques_to_explain[kept]
         )
@@ -401,7 +410,7 @@ class TorqueRegression:
         """Rigid body, usual friction and all laws."""
         return list_column_groups(self.terms)
 
-    def find_columns(self, column_groups: Sequence[str]) -> Array:
+    def column_indices_of_groups(self, column_groups: Sequence[str]) -> Array:
         """(q,) columns of some parts."""
         return np.concatenate(
             [np.arange(self.whitened_design.shape[1])[self.column_slices[p]] for p in column_groups]
@@ -419,7 +428,7 @@ class TorqueRegression:
 
     def solve_values(self, column_groups: Sequence[str]) -> Array:
         """(p,) values of some parts, 0 elsewhere."""
-        index = self.find_columns(column_groups)
+        index = self.column_indices_of_groups(column_groups)
         out = np.zeros(len(self.gram_matrix))
         out[index] = solve_ridge_normal_equations(
             self.gram_matrix[np.ix_(index, index)], self.gradient[index]
@@ -438,7 +447,7 @@ class TorqueRegression:
 
         The larger of that of white noise and of the sandwich over groups [Liang and Zeger 1986].
         """
-        index = self.find_columns(column_groups)
+        index = self.column_indices_of_groups(column_groups)
         gram = self.gram_matrix[np.ix_(index, index)]
         scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
         unit = gram / np.outer(scale, scale) + RELATIVE_TORQUE_RIDGE * np.eye(len(index))

@@ -227,7 +227,7 @@ class MotionLogs:
         return self.is_sample_moving[self.row_samples]
 
     @cached_property
-    def is_row_fitted(self) -> Array:
+    def fitted_row_mask_by_joint(self) -> Array:
         """(R, n) True for rows that are fitted: every THIN-th, no reversal, gap or end close by."""
         number = (self.row_samples - self.run_starts[self.run_index]) // int(
             SAMPLE_RATE_HZ / ROW_RATE_HZ
@@ -409,7 +409,7 @@ def estimate_autoregressive_whitening(
     The prediction from the rows before is that of Yule and Walker, of every order up to AR_ORDER:
     a row after a gap has fewer before it.
     """
-    kept = logs.is_row_fitted.T
+    kept = logs.fitted_row_mask_by_joint.T
     before = np.zeros(kept.shape, dtype=int)  # fitted rows of the same joint and run just before
     for i in range(FITTED_ROW_STRIDE, kept.shape[1]):
         last = i - FITTED_ROW_STRIDE

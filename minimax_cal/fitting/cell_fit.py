@@ -56,7 +56,7 @@ from minimax_cal.modelling.effects_in_model import (
 )
 from minimax_cal.modelling.error_rows import linearise_to_point_rows
 from minimax_cal.modelling.global_start import NO_BASE_ROTATION
-from minimax_cal.modelling.nearby_fit import fit_nearby
+from minimax_cal.modelling.nearby_fit import fit_within_bounds_from_start
 from minimax_cal.modelling.parameters import ParameterNames, ParameterValues
 from minimax_cal.modelling.point_model import (
     NO_POSE_MIX,
@@ -191,7 +191,7 @@ def fit_cell(
     mix = NO_POSE_MIX
     if options.objective == "pose":
         mix, model = pose_error_weights(data, options.lever), fit.robust.model_weighted_by_pose
-        squares = fit_nearby(with_pose_errors(model, mix), state, options.method)
+        squares = fit_within_bounds_from_start(with_pose_errors(model, mix), state, options.method)
         state = squares.x.take(np.array(0))
 
     # The worst target or point, with the distances between targets kept [paper M].

@@ -18,7 +18,7 @@ from scipy.special import stdtr
 from minimax_cal.core.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.error_rows import lack_of_fit_motions_by_pose
-from minimax_cal.modelling.nearby_fit import fit_nearby
+from minimax_cal.modelling.nearby_fit import fit_within_bounds_from_start
 from minimax_cal.modelling.parameters import (
     ParameterValues,
     flatten_link_parameters,
@@ -186,7 +186,9 @@ def fit_state_with_links(
     weight[: 5 * robot.joints] = (
         TRIAL_NOISES[0] / (LINK_VARIANCE_FACTORS[-1] * nominal_link_deviations(robot))
     ) ** 2
-    found = fit_nearby(model.with_prior(replace(model.prior, weight=weight)), state)
+    found = fit_within_bounds_from_start(
+        model.with_prior(replace(model.prior, weight=weight)), state
+    )
     return found.x.take(np.array(0))
 
 

@@ -15,8 +15,8 @@ import numpy as np
 import scipy
 
 from minimax_cal.core.arrays import Array, rms
-from minimax_cal.core.display_text import capitalise_sentence, format_counts
-from minimax_cal.core.files import read_saved_json
+from minimax_cal.core.display_text import capitalise_sentence, format_counts_largest_first
+from minimax_cal.core.files import read_saved_result_json
 from minimax_cal.core.record_fields import (
     SEPARATE_FIELD_FORMAT,
     FieldFormat,
@@ -652,7 +652,7 @@ class Fit(Result):
 
     def describe_qp_backends(self) -> str:
         """Backends with the number of QPs they answered, and how rough the answers were."""
-        who = format_counts(self.answered)
+        who = format_counts_largest_first(self.answered)
         residual = self.work.qp_residual
         if residual > MAX_SILENT_QP_RESIDUAL:
             who += f" (used as they are, relative residual up to {residual:.1g})"
@@ -847,7 +847,7 @@ def load_fit(path: Fit | Path | str) -> Fit | RelativeCalibration:
     """
     if isinstance(path, Fit):
         return path
-    content = read_saved_json(path)
+    content = read_saved_result_json(path)
     if "measured" in content and content.get("kind") != Fit.KIND:
         from minimax_cal.fitting.multi_instrument.relative_result import (
             read_result,

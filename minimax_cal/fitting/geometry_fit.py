@@ -35,7 +35,7 @@ from minimax_cal.measuring.pose_groups import group_repeated_poses
 from minimax_cal.modelling import global_start
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.global_start import BaseFit
-from minimax_cal.modelling.nearby_fit import fit_nearby
+from minimax_cal.modelling.nearby_fit import fit_within_bounds_from_start
 from minimax_cal.modelling.parameters import ParameterValues, joint_zero_indices
 from minimax_cal.modelling.point_model import PointLeastSquares, PointModel, build_point_model
 from minimax_cal.robots.robot import Robot
@@ -117,14 +117,14 @@ class FitTask:
         """
         sigma, effect_weight = self.prior_sigma, model.prior.weight[len(self.prior_sigma) :]
         if not np.isfinite(sigma).any():
-            return model, fit_nearby(model, begin, self.options.method)
+            return model, fit_within_bounds_from_start(model, begin, self.options.method)
         points = float(model.pose_counts_by_target[self.fitted_targets].sum())
         following = 3.0 * (~self.fitted_targets).sum()
         variance = self.start.mean_square / 3.0
         for _ in range(MAX_PRIOR_ROUNDS):
             weight = np.concatenate([variance / sigma**2, effect_weight])
             model = model.with_prior(replace(model.prior, weight=weight))
-            fit = fit_nearby(model, begin, self.options.method)
+            fit = fit_within_bounds_from_start(model, begin, self.options.method)
             state = fit.x.take(np.array(0))
 
             # Degrees of freedom: numbers measured less those that the data pay for parameters,
@@ -227,7 +227,7 @@ def fit_geometry(task: FitTask, progress: Progress, *, with_search: bool = True)
     # The largest set of parameters whose Gram matrix has full rank, in an order of preference.
     progress("identifiable parameters")
     robot, begin = task.robot, task.start.state
-    model = task.model.weight_targets(task.target_weights)
+    model = task.model.with_target_weights(task.target_weights)
     identification = task.identify_parameters(model, begin)
 
     # Gauss-Newton, separable or joint [paper S], then the loss and the trimming.
@@ -270,7 +270,7 @@ def separate_coaxial_axes(task: FitTask, fit: ParameterFit, joint: int) -> Param
     """The fit with a joint's axis and the next apart in any direction, if the poses show it."""
     robust, model, known = (
         fit.robust,
-        task.model.weight_targets(task.target_weights),
+        task.model.with_target_weights(task.target_weights),
         fit.identification,
     )
     trial = build_offset_trial(

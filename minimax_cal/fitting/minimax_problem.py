@@ -32,7 +32,12 @@ from minimax_cal.solvers.dual_bound import (
     dual_lower_bound,
     relative_duality_gap,
 )
-from minimax_cal.solvers.linearisation import Kkt, Linearisation, measure_kkt
+from minimax_cal.solvers.linearisation import (
+    FunctionsAndConstraints,
+    Kkt,
+    Linearisation,
+    measure_kkt,
+)
 from minimax_cal.solvers.minimax import Optimum
 
 DISTANCE_FORMS = ("two-sided", "squared", "off")
@@ -185,12 +190,11 @@ class MinimaxProblem:
             jacobian, c = 2.0 * c[:, None] * jacobian, c**2
         return c, jacobian[:, self.model.active] / self.scale
 
-    def evaluate(self, x: ParameterValues) -> tuple[Array, Array]:
+    def evaluate(self, x: ParameterValues) -> FunctionsAndConstraints:
         """f and c."""
         value, _ = ERROR_FUNCTIONS[self.per]
-        return (
-            value(self.model, x) + prior_cost_per_point(self.model, x)
-        ) / self.size, self.constraint_values_and_jacobian(x)[0]
+        cost = value(self.model, x) + prior_cost_per_point(self.model, x)
+        return FunctionsAndConstraints(cost / self.size, self.constraint_values_and_jacobian(x)[0])
 
     def linearise(self, x: ParameterValues) -> Linearisation:
         """f, c and their derivatives; the curvature is Gauss-Newton's 2 J'J."""

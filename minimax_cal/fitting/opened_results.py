@@ -15,8 +15,12 @@ import numpy as np
 
 from minimax_cal.core.arrays import Array
 from minimax_cal.core.errors import CalibrationError, DataError, OptionError
-from minimax_cal.core.files import read_saved_json
-from minimax_cal.core.record_parsing import WRITE_AGAIN_ADVICE, convert_read_errors, parse_record
+from minimax_cal.core.files import read_saved_result_json
+from minimax_cal.core.record_parsing import (
+    WRITE_AGAIN_ADVICE,
+    parse_record,
+    raise_read_errors_as_calibration_error,
+)
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.joint_spans import JointSpan, measure_joint_spans
 from minimax_cal.fitting.options import Options, read_options, split_names
@@ -32,7 +36,7 @@ from minimax_cal.modelling.cell import Cell, cell_from_dict
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.modelling.effects_in_model import extend_model_with_effects
 from minimax_cal.modelling.global_start import fit_base_and_targets
-from minimax_cal.modelling.nearby_fit import fit_nearby
+from minimax_cal.modelling.nearby_fit import fit_within_bounds_from_start
 from minimax_cal.modelling.point_model import build_point_model
 from minimax_cal.robots.robot import Robot, robot_from_dict
 from minimax_cal.solvers.status import Status
@@ -179,7 +183,7 @@ def place_unplaced_cell(cell: Cell, data: Measurements) -> Cell:
     for _ in range(PLACING_PASSES):
         bent, begin = extend_model_with_effects(model, cell.robot, data, state, terms)
         alone = bent.with_active(np.pad(free, (0, len(state.effects))))
-        state = fit_nearby(alone, begin).x.take(np.array(0))
+        state = fit_within_bounds_from_start(alone, begin).x.take(np.array(0))
     return Cell.from_parameters(cell.robot, state, data.target_names, cell.effects, cell.sessions)
 
 
@@ -197,7 +201,7 @@ def open_result(source: ResultOrFile | OpenedResult, step_name: int | None = Non
     elif isinstance(source, Cell):
         found = OpenedResult(source.robot.name, (ArmStep(CALIBRATED, source),), 0)
     elif isinstance(source, Path | str):
-        found = open_json_content(read_saved_json(source), str(source))
+        found = open_json_content(read_saved_result_json(source), str(source))
     else:
         content = source.to_dict()
         found = open_json_content(content, str(content.get("kind", "result")))
@@ -217,7 +221,7 @@ def open_json_content(content: Mapping[str, Any], source: str) -> OpenedResult:
     """From the JSON of a result, by its kind.  Raises CalibrationError."""
     kind = content.get("kind", "calibration")
     if kind == "diagnosis":
-        with convert_read_errors(source):
+        with raise_read_errors_as_calibration_error(source):
             return open_diagnosis(content, source)
     if kind == RELATIVE_CALIBRATION_KIND:
         return open_relative_calibration(content, source)
@@ -313,7 +317,7 @@ def read_effect_list(effects: object) -> tuple[str | Term, ...]:
         if isinstance(each, Term) or (isinstance(each, str) and not each.endswith(".json")):
             out.append(each)
         elif isinstance(each, Path | str):
-            out += read_confirmed_effects(read_saved_json(each), str(each))
+            out += read_confirmed_effects(read_saved_result_json(each), str(each))
         elif isinstance(each, SavableResult):
             out += read_confirmed_effects(each.to_dict(), "the diagnosis")
         else:
@@ -327,13 +331,13 @@ def read_confirmed_effects(content: Mapping[str, Any], source: str) -> list[Term
     Raises CalibrationError.
     """
     if content.get("kind") == RELATIVE_CALIBRATION_KIND and "diagnosis" in content:
-        with convert_read_errors(source):
+        with raise_read_errors_as_calibration_error(source):
             cell = content.get("cell")
             terms = cell_from_dict(cell, f"{source}: cell").effects.cause_terms if cell else ()
             return select_confirmed_effects(content["diagnosis"], terms)
     if content.get("kind") != "diagnosis":
         raise OptionError(f"{source}: is no diagnosis, so that it names no effects")
-    with convert_read_errors(source):
+    with raise_read_errors_as_calibration_error(source):
         return select_confirmed_effects(
             content, read_diagnosis_steps(content, source)[-1].cell.effects.terms
         )

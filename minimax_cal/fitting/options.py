@@ -32,7 +32,7 @@ from minimax_cal.solvers.least_squares import (
     JOINT_METHOD_NAME,
     LEAST_SQUARES_METHODS,
 )
-from minimax_cal.solvers.qp_function import QpFunction, adapt_qp_function
+from minimax_cal.solvers.qp_function import QpFunction, build_verified_qp_solver
 from qp_backends import BackendError
 from qp_backends import solve as solve_qp
 from qp_backends.registry import BackendName, backend
@@ -334,7 +334,7 @@ def build_qp_solver(qp: QpSolver, tolerance: float) -> tuple[VerifiedQpSolver, t
     if not (isinstance(qp, str) or callable(qp)):
         raise OptionError(f"qp={qp!r}: give the name of a backend, or a function")
     if not isinstance(qp, str):
-        return adapt_qp_function(qp, tolerance, qp_solver_name(qp)), ()
+        return build_verified_qp_solver(qp, tolerance, qp_solver_name(qp)), ()
     name, notices = select_usable_qp_backend(qp)
     return partial(solve_qp, name=name, tolerance=tolerance), notices
 

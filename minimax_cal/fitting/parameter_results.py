@@ -9,7 +9,7 @@ from typing import Annotated, Any, overload
 import numpy as np
 
 from minimax_cal.core.arrays import Array
-from minimax_cal.core.files import to_plain_json
+from minimax_cal.core.files import convert_to_plain_json
 from minimax_cal.core.optional_packages import import_optional
 from minimax_cal.core.record_fields import FieldFormat, round_to_15_digits
 from minimax_cal.core.record_parsing import parse_record_fields
@@ -114,7 +114,9 @@ class Parameter:
             correction = self.file_scale_and_unit[0] * (self.value - self.nominal)
             out |= {"correction": correction, "corrects": self.corrected_quantity}
         why = ("because", "like") if not self.reason else ()
-        return dict(to_plain_json({key: value for key, value in out.items() if key not in why}))
+        return dict(
+            convert_to_plain_json({key: value for key, value in out.items() if key not in why})
+        )
 
     @staticmethod
     def from_dict(content: Any, at: str) -> Parameter:

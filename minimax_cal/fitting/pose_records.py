@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from minimax_cal.core.arrays import Array
-from minimax_cal.core.errors import CalibrationError, DataError, describe_error
-from minimax_cal.core.files import array_from_json, to_plain_json
+from minimax_cal.core.errors import CalibrationError, DataError, describe_file_content_error
+from minimax_cal.core.files import array_from_json, convert_to_plain_json
 from minimax_cal.core.record_parsing import FILE_CONTENT_ERRORS, WRITE_AGAIN_ADVICE
 from minimax_cal.measuring.measurements import MAX_POINT_DISTANCE, Measurements, measurements
 from minimax_cal.measuring.visit_history import has_order_numbers, rows_in_visit_order
@@ -48,7 +48,7 @@ def build_pose_records(
         "columns": columns,
         **({"simulated": True} if data.simulated else {}),
     }
-    return dict(to_plain_json(whole))
+    return dict(convert_to_plain_json(whole))
 
 
 def parse_pose_records(content: Mapping[str, Any], source: str) -> tuple[Measurements, Array]:
@@ -74,8 +74,8 @@ def parse_pose_records(content: Mapping[str, Any], source: str) -> tuple[Measure
             raise ValueError("its parts differ in length")
     except (KeyError, TypeError, ValueError, AttributeError, DataError) as error:
         raise DataError(
-            f"{source}: its list of poses cannot be read ({describe_error(error)}); write the file "
-            "again with minimax-cal calibrate"
+            f"{source}: its list of poses cannot be read ({describe_file_content_error(error)}); "
+            "write the file again with minimax-cal calibrate"
         ) from error
     known = Measurements(data.q, data.y, names, sliding, line, columns, source=source)
     return replace(known, simulated=content.get("simulated") is True), held
@@ -113,7 +113,7 @@ def parse_measured_poses(
     except FILE_CONTENT_ERRORS as error:
         raise CalibrationError(
             f"{source}: its list of poses cannot be read "
-            f"({describe_error(error)}); {WRITE_AGAIN_ADVICE}"
+            f"({describe_file_content_error(error)}); {WRITE_AGAIN_ADVICE}"
         ) from error
 
 

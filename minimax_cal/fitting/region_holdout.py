@@ -36,7 +36,7 @@ from minimax_cal.fitting.joint_spans import (
 from minimax_cal.fitting.uncertainty import Estimator, LinearisedFit, PosewiseFit, RegionSums
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.pose_groups import HoldoutRegion, group_repeated_poses
-from minimax_cal.modelling.nearby_fit import fit_nearby, is_within_bounds
+from minimax_cal.modelling.nearby_fit import fit_within_bounds_from_start, is_within_bounds
 from minimax_cal.modelling.parameters import ParameterValues
 from minimax_cal.modelling.point_model import PointLeastSquares
 from minimax_cal.robots.robot import Robot
@@ -414,7 +414,7 @@ def fit_remaining_poses(
     effects, nominal = state.effects.copy(), rest.prior.mean[rest.names.geometric_count :]
     dropped = free[is_dropped] - rest.names.geometric_count
     effects[dropped] = nominal[dropped]
-    found = fit_nearby(rest.with_active(active), replace(state, effects=effects))
+    found = fit_within_bounds_from_start(rest.with_active(active), replace(state, effects=effects))
     return found.x.take(np.array(0)) if found.status[0] is Status.CONVERGED else None
 
 

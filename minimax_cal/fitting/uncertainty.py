@@ -19,7 +19,7 @@ import numpy as np
 from scipy.special import gammaincinv, stdtrit
 
 from minimax_cal.core.arrays import Array
-from minimax_cal.core.errors import CalibrationError, OptionError, describe_error
+from minimax_cal.core.errors import CalibrationError, OptionError, describe_file_content_error
 from minimax_cal.core.units import file_unit
 from minimax_cal.modelling.cell import Cell, build_measurements_at_rest
 from minimax_cal.modelling.effects.table import effect_parameter_names_and_units
@@ -600,7 +600,8 @@ def uncertainty_from_dict(content: Mapping[str, Any], cell: Cell, source: str) -
         dof, kind = float(part["degrees_of_freedom"]), str(part["source"])
     except (KeyError, TypeError, ValueError) as error:
         raise CalibrationError(
-            f"{source}: its covariance does not fit its robot and targets ({describe_error(error)})"
+            f"{source}: its covariance does not fit its robot and targets "
+            f"({describe_file_content_error(error)})"
         ) from error
     if not np.isfinite(rows).all() or np.any(np.diag(rows) < 0.0) or np.any(rows != rows.T):
         raise CalibrationError(f"{source}: its covariance is no symmetric matrix of numbers")

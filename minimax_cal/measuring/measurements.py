@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from minimax_cal.core.arrays import Array
-from minimax_cal.core.display_text import format_first_names, shorten_to_one_line
+from minimax_cal.core.display_text import clean_and_shorten_to_one_line, format_first_names
 from minimax_cal.core.errors import DataError
 from minimax_cal.core.files import format_csv, write_file_atomically
 from minimax_cal.reading.column_words import (
@@ -295,7 +295,7 @@ def check_real_numbers(name: str, values: Array) -> Array:
         return found.astype(float)
     except (TypeError, ValueError) as error:
         raise DataError(
-            f"{name} must be an array of numbers ({shorten_to_one_line(str(error))})"
+            f"{name} must be an array of numbers ({clean_and_shorten_to_one_line(str(error))})"
         ) from error
 
 

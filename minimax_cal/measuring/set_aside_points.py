@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from minimax_cal.core.arrays import Array
-from minimax_cal.core.display_text import format_first_names, shorten_to_one_line
+from minimax_cal.core.display_text import clean_and_shorten_to_one_line, format_first_names
 from minimax_cal.core.errors import DataError, OptionError
 from minimax_cal.measuring.measurements import (
     SET_ASIDE_BY_FILE,
@@ -176,7 +176,10 @@ def set_aside_points_named_by_user(data: Measurements, point_texts: Iterable[str
 
 def clean_reason_text(text: str) -> str:
     """A reason as a file can hold it."""
-    return shorten_to_one_line(text).replace(";", ",").strip()[:MAX_REASON_LETTERS] or NO_REASON
+    return (
+        clean_and_shorten_to_one_line(text).replace(";", ",").strip()[:MAX_REASON_LETTERS]
+        or NO_REASON
+    )
 
 
 def point_mask_from_text(data: Measurements, point_text: str) -> Array:

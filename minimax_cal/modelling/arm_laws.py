@@ -13,7 +13,7 @@ from minimax_cal.modelling.effects.scene import PosedArm
 from minimax_cal.modelling.effects.table import EFFECTS, FREE_CHOICE_KEYS, Term
 from minimax_cal.modelling.error_rows import PoseRows
 from minimax_cal.modelling.gear_periodogram import (
-    find_strongest_gear_lines,
+    find_gear_lines_with_tried_counts,
     is_line_near_expected_ratio,
 )
 from minimax_cal.selection.candidate_library import CandidateLibrary, LawColumns
@@ -61,17 +61,21 @@ class ArmLaws:
         return [replace(term, choice=choice) for choice in choices]
 
     def lines(self, noise: Noise, known: Array, found: Sequence[Term]) -> list[tuple[Term, float]]:
-        """Lines of gears, with the frequencies tried: `periodogram.find_strongest_gear_lines`."""
+        """Lines of gears, with the frequencies tried:
+        `periodogram.find_gear_lines_with_tried_counts`.
+        """
         if GEAR_RIPPLE.name in self.exclude:
             return []
-        return find_strongest_gear_lines(self.scene, self.problem, noise, known, found_lines=found)
+        return find_gear_lines_with_tried_counts(
+            self.scene, self.problem, noise, known, found_lines=found
+        )
 
     def is_expected(self, line: Term, found: Sequence[Term]) -> bool:
         """Whether a line is where its gear's is."""
         return is_line_near_expected_ratio(self.scene, line, found)
 
 
-def build_arm_library(
+def build_library_of_testable_arm_laws(
     posed_arm: PosedArm, rows: PoseRows, excluded_effects: Sequence[str] = ()
 ) -> CandidateLibrary:
     """Every effect at every place in every variant that the data can test."""

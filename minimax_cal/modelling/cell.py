@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from minimax_cal.core.arrays import Array
-from minimax_cal.core.errors import CalibrationError, DataError, describe_error
-from minimax_cal.core.files import read_saved_json
+from minimax_cal.core.errors import CalibrationError, DataError, describe_file_content_error
+from minimax_cal.core.files import read_saved_result_json
 from minimax_cal.core.units import metres_to_file_mm
 from minimax_cal.measuring.measurement_checks import check_and_complete_joints
 from minimax_cal.measuring.measurements import Measurements
@@ -246,7 +246,7 @@ def cell_from_dict(content: Mapping[str, Any], source: str) -> Cell:
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise CalibrationError(
             f"{source}: is not a saved calibration (robot, base, "
-            f"targets_mm: {describe_error(error)}); "
+            f"targets_mm: {describe_file_content_error(error)}); "
             "write one with minimax-cal calibrate"
         ) from error
     if not np.abs(spots).max(initial=0.0) <= MAX_SAVED_POSITION:
@@ -265,7 +265,7 @@ def cell_from_dict(content: Mapping[str, Any], source: str) -> Cell:
                 raise ValueError(f"{term.label}: {len(value)} values for {', '.join(names)}")
     except (KeyError, IndexError, ValueError) as error:
         raise CalibrationError(
-            f"{source}: its effects do not fit its robot ({describe_error(error)})"
+            f"{source}: its effects do not fit its robot ({describe_file_content_error(error)})"
         ) from error
     return cell
 
@@ -303,7 +303,7 @@ def load_cell(path: Path | str) -> Cell:
     --------
     >>> mc.load_cell("fit.json").predict([[0, 0.3, 0.2, 0, 0.5, 0]])
     """
-    return cell_from_dict(read_saved_json(path), str(path))
+    return cell_from_dict(read_saved_result_json(path), str(path))
 
 
 def list_session_and_time_notices(cell: Cell, data: Measurements) -> tuple[str, ...]:

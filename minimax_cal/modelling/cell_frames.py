@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
@@ -71,9 +72,14 @@ def frame_with_nominal_and_correction(
     return out
 
 
-def fit_tool_poses(
-    calibrated_points: Array, nominal_points: Array
-) -> tuple[Array | None, Array | None]:
+class ToolPoses(NamedTuple):
+    """(4, 4) poses of the reflectors as one body, or None."""
+
+    calibrated: Array | None
+    nominal: Array | None
+
+
+def fit_tool_poses(calibrated_points: Array, nominal_points: Array) -> ToolPoses:
     """(4, 4) of the reflectors as one body, calibrated and drawn; None where they tell no turn.
 
     calibrated_points, nominal_points: (k, 3) in the flange [m].
@@ -83,10 +89,11 @@ def fit_tool_poses(
         nominal_points - nominal_points.mean(axis=0),
     )
     if len(calibrated_points) < 3 or any(is_nearly_collinear(each) for each in (new, old)):
-        return None, None
+        return ToolPoses(None, None)
     turn = nearest_rotations(new.T @ old)
-    return build_transform(turn, calibrated_points.mean(axis=0)), build_transform(
-        np.eye(3), nominal_points.mean(axis=0)
+    return ToolPoses(
+        build_transform(turn, calibrated_points.mean(axis=0)),
+        build_transform(np.eye(3), nominal_points.mean(axis=0)),
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from minimax_cal.modelling.effects.table import (
     effect_prior_weights,
     session_frame_terms,
 )
-from minimax_cal.modelling.nearby_fit import fit_nearby
+from minimax_cal.modelling.nearby_fit import fit_within_bounds_from_start
 from minimax_cal.modelling.parameters import ParameterNames, ParameterValues
 from minimax_cal.modelling.point_model import GaussianPrior, PointModel, build_point_model
 from minimax_cal.robots.robot import Robot
@@ -41,13 +42,20 @@ def split_values_by_effect(terms: Sequence[Term], posed_arm: PosedArm, values: A
     return Fitted(tuple(terms), tuple(np.split(values, np.cumsum(sizes)[:-1])) if terms else ())
 
 
+class ModelAtValues(NamedTuple):
+    """A model, and the values of its parameters."""
+
+    model: PointModel
+    values: ParameterValues
+
+
 def extend_model_with_effects(
     model: PointModel,
     robot: Robot,
     data: Measurements,
     state: ParameterValues,
     terms: Sequence[Term],
-) -> tuple[PointModel, ParameterValues]:
+) -> ModelAtValues:
     """The geometric model with the effects' columns at a state, and the state with their values.
 
     Parameters that the state does not hold yet, the last ones, are zero.  Columns are constant;
@@ -64,23 +72,26 @@ def extend_model_with_effects(
         moved = exact - scene.points - np.tensordot(values, fields, 1)
     count, more = model.names.geometric_count, len(names)
     prior, ridge = model.prior, effect_prior_weights(terms, scene)
-    return replace(
-        model,
-        names=replace(model.names, effects=names),
-        fields=fields,
-        moved=moved,
-        active=np.concatenate([model.active[:count], np.ones(more, dtype=bool)]),
-        prior=GaussianPrior(
-            np.concatenate([prior.mean[:count], np.zeros(more)]),
-            np.concatenate([prior.weight[:count], ridge]),
-            np.concatenate([np.zeros(count), np.where(ridge > 0.0, PRIOR_REFERENCE_ERROR**2, 0.0)]),
+    return ModelAtValues(
+        replace(
+            model,
+            names=replace(model.names, effects=names),
+            fields=fields,
+            moved=moved,
+            active=np.concatenate([model.active[:count], np.ones(more, dtype=bool)]),
+            prior=GaussianPrior(
+                np.concatenate([prior.mean[:count], np.zeros(more)]),
+                np.concatenate([prior.weight[:count], ridge]),
+                np.concatenate(
+                    [np.zeros(count), np.where(ridge > 0.0, PRIOR_REFERENCE_ERROR**2, 0.0)]
+                ),
+            ),
         ),
-    ), replace(state, effects=values)
+        replace(state, effects=values),
+    )
 
 
-def build_model_of_cell(
-    cell: Cell, poses: Measurements | Array
-) -> tuple[PointModel, ParameterValues]:
+def build_model_of_cell(cell: Cell, poses: Measurements | Array) -> ModelAtValues:
     """The model of a cell, effects included, where nothing was measured, and its state.
 
     poses: (m, n) joint values [rad, m], or measurements, whose columns (order, payload ...) count.
@@ -100,7 +111,7 @@ def build_model_of_cell(
         prior=GaussianPrior(nothing, nothing),
     )
     if not cell.effects.terms:
-        return model, cell.parameter_values
+        return ModelAtValues(model, cell.parameter_values)
     hidden = cell.align_to_first_session(replace(poses, target_names=cell.target_names))
     return extend_model_with_effects(
         model, cell.robot, hidden, cell.parameter_values, cell.effects.terms
@@ -113,7 +124,7 @@ def fit_geometry_nearby(
     start: ParameterValues,
     active: Array,
     prior_weight: float | Array = 0.0,
-) -> tuple[PointModel, ParameterValues]:
+) -> ModelAtValues:
     """Geometry alone by least squares, from a fit that is near, and where it ends.
 
     active: (p,) the geometric parameters that are free; so are the frames of further sessions.
@@ -126,4 +137,4 @@ def fit_geometry_nearby(
     model = model.with_prior(replace(model.prior, weight=model.prior.weight + prior_weight))
     if free := session_frame_terms(data.frames):
         model, begin = extend_model_with_effects(model, robot, data, begin, free)
-    return model, fit_nearby(model, begin).x.take(np.array(0))
+    return ModelAtValues(model, fit_within_bounds_from_start(model, begin).x.take(np.array(0)))

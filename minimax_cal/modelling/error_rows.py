@@ -14,7 +14,7 @@ each with a random factor [Rasmussen and Williams 2006].
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -154,9 +154,16 @@ def joint_radian_equivalents(robot: Robot) -> Array:
     return np.where(robot.prismatic, robot.reach(), 1.0)
 
 
+class FunctionMotions(NamedTuple):
+    """Motion of the points by the factor of each function, and the kind of each factor."""
+
+    motions: Array
+    kinds: Array
+
+
 def lack_of_fit_motions_by_pose(
     robot: Robot, q: Array, motions_per_joint: Array
-) -> tuple[Array, Array]:
+) -> FunctionMotions:
     """(m, r, c) motion of the points by each function's factor, and (c, 2) its kind.
 
     The kind is the joint that it turns, and what drives it.  q: (m, n) joint values with signs
@@ -183,12 +190,12 @@ def lack_of_fit_motions_by_pose(
         )
         driver = np.concatenate([driven, driven, np.full(pull.shape[1], GRAVITY_DRIVER)])
         kind.append(np.stack([np.full(len(driver), j), driver], axis=1))
-    return np.concatenate(columns, axis=2), np.concatenate(kind)
+    return FunctionMotions(np.concatenate(columns, axis=2), np.concatenate(kind))
 
 
 def lack_of_fit_motions_by_time(
     robot: Robot, session_time: Array, motions_per_joint: Array, motions_per_strain: Array
-) -> tuple[Array, Array]:
+) -> FunctionMotions:
     """(1 + WAVES, m, r, n + 1) motion by what drifts: for the whole session, then by each wave.
 
     And (n + 1,) the kind: 0 a joint's zero, 1 the length of all links.  session_time: (m,) place in
@@ -204,4 +211,4 @@ def lack_of_fit_motions_by_time(
     ]
     functions = size * np.cos(phase)
     kind = np.append(np.zeros(robot.joints, dtype=int), 1)
-    return functions[:, :, None, None] * turned, kind
+    return FunctionMotions(functions[:, :, None, None] * turned, kind)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtrc
@@ -29,7 +30,7 @@ MIN_TRIED_FREQUENCIES = 2.0  # a line is never found at once
 STRAIN_WAVE_RATIO_OFFSET = 1.0  # a strain wave gear turns by one more or less than its ratio tells
 
 
-def find_strongest_gear_lines(
+def find_gear_lines_with_tried_counts(
     posed_arm: PosedArm,
     rows: PoseRows,
     noise: Noise,
@@ -126,9 +127,14 @@ def sweep_in_turns(joint_angles: Array) -> float:
     return max(float(np.ptp(joint_angles)) / (2.0 * np.pi), 0.1)
 
 
-def expected_line_bands(
-    gear_ratio: float, waves_elsewhere: Sequence[float]
-) -> list[tuple[float, float]]:
+class WaveBand(NamedTuple):
+    """A range of waves a turn."""
+
+    low: float
+    high: float
+
+
+def expected_line_bands(gear_ratio: float, waves_elsewhere: Sequence[float]) -> list[WaveBand]:
     """Where lines of a joint's gear may be: near its ratio, else where gears of others have theirs.
 
     gear_ratio: NaN untold.  waves_elsewhere: waves a turn of lines that were heard.
@@ -136,32 +142,39 @@ def expected_line_bands(
     return line_bands_of_ratio(gear_ratio) or line_bands_of_like_gears(waves_elsewhere)
 
 
-def line_bands_of_ratio(gear_ratio: float) -> list[tuple[float, float]]:
+def line_bands_of_ratio(gear_ratio: float) -> list[WaveBand]:
     """Where lines of a gear may be, whose ratio is told, of either sign; none for NaN."""
     size = abs(gear_ratio)
     return [
-        (k * (size - STRAIN_WAVE_RATIO_OFFSET), k * (size + STRAIN_WAVE_RATIO_OFFSET))
+        WaveBand(k * (size - STRAIN_WAVE_RATIO_OFFSET), k * (size + STRAIN_WAVE_RATIO_OFFSET))
         for k in WAVES_PER_MOTOR_TURN
         if size > MIN_WAVES_PER_TURN
     ]
 
 
-def line_bands_of_like_gears(waves_elsewhere: Sequence[float]) -> list[tuple[float, float]]:
+def line_bands_of_like_gears(waves_elsewhere: Sequence[float]) -> list[WaveBand]:
     """Where lines of a gear may be that is of the kind of others, whose lines were heard."""
     ratios = {one / k for one in waves_elsewhere for k in WAVES_PER_MOTOR_TURN}
     wide = sorted(
         band
         for ratio in ratios
         for band in line_bands_of_ratio(ratio)
-        if band[1] <= MAX_WAVES_PER_TURN
+        if band.high <= MAX_WAVES_PER_TURN
     )
-    out: list[tuple[float, float]] = []
-    for low, high in wide:
-        if out and low <= out[-1][1]:
-            out[-1] = (out[-1][0], max(high, out[-1][1]))
+    out: list[WaveBand] = []
+    for band in wide:
+        if out and band.low <= out[-1].high:
+            out[-1] = WaveBand(out[-1].low, max(band.high, out[-1].high))
         else:
-            out.append((low, high))
+            out.append(band)
     return out
+
+
+class StrongestWave(NamedTuple):
+    """The strongest wave of a band, and the number of independent frequencies in the band."""
+
+    waves_per_turn: float
+    tried_frequency_count: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,14 +196,15 @@ class WaveScore:
 
     def find_strongest_wave(
         self, min_waves_per_turn: float, max_waves_per_turn: float
-    ) -> tuple[float, float]:
+    ) -> StrongestWave:
         """The strongest of a band, and the number of independent frequencies in it."""
         step = 1.0 / (FREQUENCY_OVERSAMPLING * sweep_in_turns(self.q))
         turns = np.arange(min_waves_per_turn, max_waves_per_turn + step, step)
         near = turns[int(np.argmax(self.gains_of_waves(turns)))] + step * np.linspace(-1.0, 1.0, 41)
-        return float(near[int(np.argmax(self.gains_of_waves(near)))]), len(
-            turns
-        ) / FREQUENCY_OVERSAMPLING * 2.0
+        return StrongestWave(
+            float(near[int(np.argmax(self.gains_of_waves(near)))]),
+            len(turns) / FREQUENCY_OVERSAMPLING * 2.0,
+        )
 
     def is_wave_in_both_halves(
         self, waves_per_turn: float, max_gain_difference: float = MAX_HALF_SWEEP_GAIN_DIFFERENCE
@@ -213,9 +227,17 @@ class WaveScore:
         )
 
 
+class WaveSums(NamedTuple):
+    """Sums over poses of score e^(i k q) (f,), of size e^(2 i k q) (f,), and of size."""
+
+    score_sums: Array
+    size_sums: Array
+    size_total: float
+
+
 def sum_wave_products(
     waves_per_turn: Array, joint_angles: Array, score: Array, size: Array
-) -> tuple[Array, Array, float]:
+) -> WaveSums:
     """Sums over poses of score e^(i k q) and of size e^(2 i k q) for turns k (f,), and of size.
 
     waves_per_turn: equally spaced, so that every wave is a product of one from a coarse grid and
@@ -232,7 +254,7 @@ def sum_wave_products(
     )
     pull = (coarse * score) @ fine.T
     square = (coarse**2 * size) @ (fine**2).T
-    return (
+    return WaveSums(
         pull.reshape(-1)[: len(waves_per_turn)],
         square.reshape(-1)[: len(waves_per_turn)],
         float(size.sum()),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -58,6 +59,13 @@ class BaseFit:
     mean_square: float
 
 
+class RotationFit(NamedTuple):
+    """A rotation (3, 3), and what it costs."""
+
+    rotation: Array
+    cost: float
+
+
 @dataclass(frozen=True, eq=False)
 class RotationProblem:
     """|matrix vec(S) - right|^2 over the rotations S.
@@ -68,7 +76,7 @@ class RotationProblem:
     matrix: Array
     right: Array
 
-    def solve(self) -> tuple[Array, float]:
+    def solve(self) -> RotationFit:
         """The best rotation, and what it costs.
 
         From the unconstrained minimum projected by SVD, and where that may not be the only minimum
@@ -76,17 +84,17 @@ class RotationProblem:
         """
         guess = np.linalg.lstsq(self.matrix, self.right, rcond=1e-9)[0].reshape(3, 3)
         found = self.refine_best_start(nearest_rotations(guess[None]))
-        if self.is_only_minimum(found[0], guess):
+        if self.is_only_minimum(found.rotation, guess):
             return found
-        return min(found, self.refine_best_start(CUBE_ROTATIONS), key=lambda one: one[1])
+        return min(found, self.refine_best_start(CUBE_ROTATIONS), key=lambda fit: fit.cost)
 
-    def refine_best_start(self, start_rotations: Array) -> tuple[Array, float]:
+    def refine_best_start(self, start_rotations: Array) -> RotationFit:
         """The best minimum that some starts (s, 3, 3) lead to."""
         found, cost = active_kernels().refine_rotations(
             self.matrix, self.right, *prepare_kernel_arrays(start_rotations)
         )
         winner = int(np.argmin(cost))
-        return found[winner], float(cost[winner])
+        return RotationFit(found[winner], float(cost[winner]))
 
     def is_only_minimum(self, rotation: Array, unconstrained: Array) -> bool:
         """Whether no other rotation can be a better minimum.

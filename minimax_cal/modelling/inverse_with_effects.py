@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -133,6 +134,27 @@ def effect_joint_shifts_and_flange_motions(cell: Cell, data: Measurements) -> tu
     return turn, fit_rigid_motions(before, before + np.moveaxis(shift, -1, 0))
 
 
+class JointBounds(NamedTuple):
+    """Least and largest joint values that are allowed, (m, n) each."""
+
+    lower: Array
+    upper: Array
+
+
+class InverseSolution(NamedTuple):
+    """Corrected joint values (m, n), and how each target ended."""
+
+    q: Array
+    outcomes: tuple[InverseOutcome, ...]
+
+
+class ConsistentJoints(NamedTuple):
+    """Joint values (m, n), and (m,) True where they agree with the effects that they cause."""
+
+    q: Array
+    is_consistent: Array
+
+
 @dataclass(frozen=True, eq=False)
 class InverseProblem:
     """The search for joints of an arm at goals along a path.
@@ -153,12 +175,13 @@ class InverseProblem:
         return np.clip(self.data.q, self.arm.robot.lower, self.arm.robot.upper)
 
     @property
-    def joint_bounds(self) -> tuple[Array, Array]:
+    def joint_bounds(self) -> JointBounds:
         """Least and largest joints that are allowed: (m, n) each."""
         robot = self.arm.robot
         room = self.most_change * np.where(robot.prismatic, SLIDE_METRES_PER_RADIAN, 1.0)
-        return np.maximum(robot.lower, self.start_joints - room), np.minimum(
-            robot.upper, self.start_joints + room
+        return JointBounds(
+            np.maximum(robot.lower, self.start_joints - room),
+            np.minimum(robot.upper, self.start_joints + room),
         )
 
     def data_at_joints(self, q: Array) -> Measurements:
@@ -181,7 +204,7 @@ class InverseProblem:
         distance, angle = self.position_and_angle_errors(q)
         return (distance <= self.tolerance) & (self.lever * angle <= self.tolerance)
 
-    def solve(self) -> tuple[Array, tuple[InverseOutcome, ...]]:
+    def solve(self) -> InverseSolution:
         """Corrected joints, and how each target ended.
 
         Goals that cannot be reached are sought again with a price on change: the arm then does
@@ -195,9 +218,9 @@ class InverseProblem:
                 begin, np.where(good, 0.0, CHANGE_WEIGHT_PER_LEVER)
             )
             good = self.reached_mask(q)
-        return q, self.classify_outcomes(q, good, settled)
+        return InverseSolution(q, self.classify_outcomes(q, good, settled))
 
-    def solve_consistent_with_effects(self, q: Array, change_weights: Array) -> tuple[Array, Array]:
+    def solve_consistent_with_effects(self, q: Array, change_weights: Array) -> ConsistentJoints:
         """Joints that agree with the effects they cause, and (m,) True where they do.
 
         Effects are taken from the joints before and kept while Newton reaches the goals.
@@ -210,7 +233,7 @@ class InverseProblem:
             change = np.abs(new - q).max(axis=1)
             q = new
             if not self.arm.effects.terms:
-                return q, np.ones(len(q), dtype=bool)
+                return ConsistentJoints(q, np.ones(len(q), dtype=bool))
             kept = data.columns if count >= PASSES_BEFORE_FIXED_SIDES else self.data.columns
             data = replace(self.data_at_joints(q), columns=kept)
             if (
@@ -223,7 +246,7 @@ class InverseProblem:
                 break
         walked, _ = effect_joint_shifts_and_flange_motions(self.arm, self.data_at_joints(q))
         agree = np.abs(walked - turn).max(axis=1) < 1e4 * MIN_JOINT_CHANGE
-        return q, agree & (change < 1e4 * MIN_JOINT_CHANGE)
+        return ConsistentJoints(q, agree & (change < 1e4 * MIN_JOINT_CHANGE))
 
     def solve_for_fixed_effects(
         self, start: Array, goal_poses: Array, joint_shifts: Array, change_weights: Array

@@ -20,6 +20,7 @@ from minimax_cal.solvers.least_squares import (
     JOINT_METHOD_NAME,
     LEAST_SQUARES_METHODS,
     NEAR_START_LIMITS,
+    CostGradientGram,
     LeastSquaresSolution,
     find_method,
     solve_normal_equations,
@@ -34,7 +35,7 @@ MAX_STEP_HALVINGS = 10  # of a step that leads up
 MAX_NEARBY_STEPS = 15  # plain steps; a start from which these do not suffice is not near
 
 
-def fit_nearby(
+def fit_within_bounds_from_start(
     model: PointModel, start: ParameterValues, method: str = JOINT_METHOD_NAME
 ) -> LeastSquaresSolution[ParameterValues]:
     """The least-squares fit of a model's free parameters from a start nearby, a batch of one.
@@ -178,7 +179,7 @@ class BoundedLeastSquaresProblem(Protocol):
     def active(self) -> Array:
         """(p,) True where one is free."""
 
-    def normal(self, x: ParameterValues) -> tuple[Array, Array, Array]:
+    def normal(self, x: ParameterValues) -> CostGradientGram:
         """Cost, slope and Gram matrix."""
 
     def step(self, x: ParameterValues, dx: Array) -> ParameterValues:

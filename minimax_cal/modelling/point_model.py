@@ -12,6 +12,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,7 +29,11 @@ from minimax_cal.robots.kernels.kernel_choice import active_kernels, prepare_ker
 from minimax_cal.robots.kernels.pose_sums import KernelData, KernelState
 from minimax_cal.robots.kinematics import LinkFrames, skew_matrix
 from minimax_cal.robots.robot import Robot
-from minimax_cal.solvers.least_squares import solve_normal_equations
+from minimax_cal.solvers.least_squares import (
+    CostGradientGram,
+    ReducedProblem,
+    solve_normal_equations,
+)
 
 MAX_POINT_WEIGHT_RATIO = (
     100.0  # no u95 counts as more than so many times better than the typical one
@@ -78,6 +83,14 @@ class GaussianPrior:
     mean: Array
     weight: Array
     beside: Array = field(default_factory=lambda: np.zeros(0))
+
+
+class BlockRows(NamedTuple):
+    """Poses of a block, its weighted errors (k, 3, c) and their Jacobian (k, p, 3, c)."""
+
+    poses: slice
+    errors: Array
+    jacobian: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +160,7 @@ class PointModel:
             mix=self.mix[rows] if len(self.mix) else self.mix,
         )
 
-    def weight_targets(self, target_weights: Array) -> PointModel:
+    def with_target_weights(self, target_weights: Array) -> PointModel:
         """The same model with the points of target i weighted by share_i too.  target_weights:
         (k,).
         """
@@ -324,16 +337,16 @@ class PointModel:
             state, block, JacobianColumns.from_active(self.names, active)
         )
 
-    def iterate_errors_and_jacobians(
-        self, state: ParameterValues
-    ) -> Iterator[tuple[slice, Array, Array]]:
+    def iterate_errors_and_jacobians(self, state: ParameterValues) -> Iterator[BlockRows]:
         """Block by block, poses, weighted errors (k, 3, c) and Jacobian (k, p, 3, c), of one state.
 
         By the free parameters, in axes of each pose's own, so that they are for sums over axes.
         """
         if len(self.mix):
             for block in self.split_into_blocks(state):
-                yield block.rows, *self.block_errors_and_jacobian(state, block, self.active)
+                yield BlockRows(
+                    block.rows, *self.block_errors_and_jacobian(state, block, self.active)
+                )
             return
         given = (
             active_kernels(),
@@ -342,7 +355,9 @@ class PointModel:
             np.flatnonzero(self.active),
         )
         for part in self.split_poses(1):
-            yield part, *pose_sums.weighted_errors_and_jacobian(*given, part.start, part.stop)
+            yield BlockRows(
+                part, *pose_sums.weighted_errors_and_jacobian(*given, part.start, part.stop)
+            )
 
     def block_errors_and_selected_jacobian(
         self, state: ParameterValues, block: PoseBlock, columns: JacobianColumns
@@ -424,22 +439,20 @@ class PointLeastSquares:
         """(free,) True for lengths."""
         return np.asarray(self.model.names.linear_mask[self.model.active])
 
-    def normal(self, x: ParameterValues) -> tuple[Array, Array, Array]:
+    def normal(self, x: ParameterValues) -> CostGradientGram:
         """Cost (...), slope (..., free) and Gram matrix (..., free, free)."""
         return self.normal_equations_of(x, self.model.active)
 
-    def normal_equations_of(self, x: ParameterValues, active: Array) -> tuple[Array, Array, Array]:
-        """The same over any choice of parameters."""
+    def normal_equations_of(self, x: ParameterValues, active: Array) -> CostGradientGram:
+        """Cost, slope and Gram matrix over the parameters that `active` (d,) marks."""
         normal, prior = self.model.normal_equations(x, active), self.model.prior
         off = prior.mean - self.model.parameter_vector(x)
         weight = prior.weight[active]
         cost = normal.cost.sum(-1) + (prior.weight * off**2).sum(-1)
         gradient = normal.gradient.sum(-2) + weight * off[..., active]
-        return cost, gradient, normal.gram.sum(-3) + np.diag(weight)
+        return CostGradientGram(cost, gradient, normal.gram.sum(-3) + np.diag(weight))
 
-    def reduced(
-        self, x: ParameterValues, *, full: bool
-    ) -> tuple[ParameterValues, Array, Array, Array, Array]:
+    def reduced(self, x: ParameterValues, *, full: bool) -> ReducedProblem[ParameterValues]:
         """The states with their best free lengths [paper S, eq. 18], `normal` there, and M.
 
         full: whether to compute the coupling M (..., r, omega); zeros otherwise.
@@ -453,11 +466,8 @@ class PointLeastSquares:
         found = self.normal_equations_of(x, model.active)
         free = self.linear
         nothing = np.zeros((*gradient.shape[:-1], free.sum(), (~free).sum()))
-        return (
-            x,
-            *found,
-            model.length_angle_coupling(x, model.split_into_blocks(x)) if full else nothing,
-        )
+        coupling = model.length_angle_coupling(x, model.split_into_blocks(x)) if full else nothing
+        return ReducedProblem(x, *found, coupling)
 
     def step(self, x: ParameterValues, dx: Array) -> ParameterValues:
         """The states moved by a step in the free parameters."""

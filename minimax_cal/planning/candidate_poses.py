@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -67,17 +68,25 @@ class CandidatePoses:
             title += f", and {self.count - self.drawn} near the best ones"
         return Table.from_rows(title, rows, "condition | rejects alone % .1f")
 
-    def add_candidates(self, q: Array, visible_targets: Array) -> CandidatePoses:
+    def with_candidates(self, q: Array, visible_targets: Array) -> CandidatePoses:
         """With further candidates."""
         both = np.concatenate([self.q, q]), np.concatenate([self.seen, visible_targets])
         return CandidatePoses(*both, self.tested, self.rejected, self.drawn)
+
+
+class JointRanges(NamedTuple):
+    """(n,) limits of the joints [rad, m], and notices on them."""
+
+    lower: Array
+    upper: Array
+    notices: tuple[str, ...]
 
 
 def find_joint_limits(
     robot: Robot,
     narrowed_limits: Mapping[int, tuple[float, float]],
     measurement_sets: Sequence[Measurements] = (),
-) -> tuple[Array, Array, tuple[str, ...]]:
+) -> JointRanges:
     """(n,) lower and upper limits [rad, m], and a notice where the robot file has none.
 
     A joint turns at most once round, and keeps a margin to the robot's limits; one without limits
@@ -119,7 +128,7 @@ def find_joint_limits(
             f"{robot.name} has no limits for joint {names}: +-180 deg are taken (slides +-500 mm); "
             "narrow them with joints="
         )
-    return lower, upper, tuple(notices)
+    return JointRanges(lower, upper, tuple(notices))
 
 
 def format_joint_ranges(
@@ -154,6 +163,13 @@ def draw_visible_candidates(
     )
 
 
+class DrawnPoses(NamedTuple):
+    """Poses (m, n), and (m, k) the targets that are seen there."""
+
+    q: Array
+    visible_targets: Array
+
+
 def draw_candidates_near_poses(
     workspace: ArmWorkspace,
     visibility: TrackerVisibility,
@@ -161,7 +177,7 @@ def draw_candidates_near_poses(
     draws_per_pose: int,
     step_fraction: float,
     rng: np.random.Generator,
-) -> tuple[Array, Array]:
+) -> DrawnPoses:
     """Poses around some (m, n) that can be taken and seen: their joints, and what is seen.
 
     draws_per_pose: how many are tried around one.  step_fraction: standard deviation, as a share of
@@ -175,7 +191,7 @@ def draw_candidates_near_poses(
     good, seen, _ = evaluate_pose_conditions(
         workspace, visibility, tried, ARM_CONDITIONS, TARGET_CONDITIONS
     )
-    return tried[good], seen[good]
+    return DrawnPoses(tried[good], seen[good])
 
 
 def draw_poses_meeting_conditions(
@@ -212,13 +228,23 @@ def draw_poses_meeting_conditions(
     return CandidatePoses(q, seen, tested, rejected, len(q))
 
 
+class ConditionResults(NamedTuple):
+    """(m,) the poses that meet all conditions, (m, k) the targets seen, and how many each
+    rejects.
+    """
+
+    is_accepted: Array
+    visible_targets: Array
+    rejections_by_condition: dict[str, int]
+
+
 def evaluate_pose_conditions(
     workspace: ArmWorkspace,
     visibility: TrackerVisibility,
     q: Array,
     arm_conditions: PoseConditions,
     target_conditions: PoseConditions,
-) -> tuple[Array, Array, dict[str, int]]:
+) -> ConditionResults:
     """Which poses (m, n) meet all conditions (m,), the targets seen (m, k), and who rejects.
 
     A pose counts if one target is seen, or all of them where the room says so.
@@ -241,7 +267,7 @@ def evaluate_pose_conditions(
         against[name] = int((~enough(meets, axis=0)).sum())
         seen &= meets
     good &= enough(seen, axis=0)
-    return good, seen.T, against
+    return ConditionResults(good, seen.T, against)
 
 
 REMEDY_BY_CONDITION = {

@@ -164,7 +164,7 @@ class SeparationPower:
     def power_with_poses(self, pose_indices: Array) -> float:
         """lambda (1 - rho^2) of old poses and those chosen."""
         return 1.0 / evaluate_information_matrix(
-            self.criterion, self.pool.sum_information(pose_indices)
+            self.criterion, self.pool.information_of_experiments(pose_indices)
         )
 
     @property

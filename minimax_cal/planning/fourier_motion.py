@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -89,14 +90,22 @@ class MotionLimits:
     acceleration: Array
 
 
+class FourierCoefficients(NamedTuple):
+    """(K, n) coefficients of cos and sin."""
+
+    cos: Array
+    sin: Array
+
+
 def project_to_rest_at_ends(
     cos_coefficients: Array, sin_coefficients: Array
-) -> tuple[Array, Array]:
+) -> FourierCoefficients:
     """The nearest coefficients (K, n) without speed and acceleration at the ends."""
     k = np.arange(1.0, len(cos_coefficients) + 1.0)[:, None]
-    return cos_coefficients - k**2 * (k**2 * cos_coefficients).sum(0) / (
-        k**4
-    ).sum(), sin_coefficients - k * (k * sin_coefficients).sum(0) / (k**2).sum()
+    return FourierCoefficients(
+        cos_coefficients - k**2 * (k**2 * cos_coefficients).sum(0) / (k**4).sum(),
+        sin_coefficients - k * (k * sin_coefficients).sum(0) / (k**2).sum(),
+    )
 
 
 def scale_motion_to_limits(motion: FourierMotion, limits: MotionLimits) -> FourierMotion:

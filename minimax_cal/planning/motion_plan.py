@@ -13,7 +13,7 @@ import numpy as np
 
 from minimax_cal.core.arrays import Array
 from minimax_cal.core.errors import OptionError
-from minimax_cal.core.files import to_plain_json
+from minimax_cal.core.files import convert_to_plain_json
 from minimax_cal.core.option_fields import (
     check_seed,
     option_field_in_group,
@@ -297,7 +297,7 @@ def plan_motion(
         notices = (*notices, NO_PAYLOAD_NOTICE)
     if not known_link_mass_mask(arm).all():
         notices = (*notices, f"{arm.name} gives no masses: the noise is that of assumed ones")
-    settings = to_plain_json(
+    settings = convert_to_plain_json(
         vars(options) | {name: getattr(room, name) for name in MOTION_RELATED_PLAN_OPTIONS}
     )
     told = tuple(predict_parameter_sigmas(model, parts))
@@ -328,9 +328,16 @@ def check_motion_options(options: MotionOptions) -> None:
         raise OptionError(f"rows={options.rows:g}: give 2 to {MAX_MOTION_ROWS_HZ:g} a second")
 
 
+class LimitsWithNotices(NamedTuple):
+    """What a motion may do, and notices on it."""
+
+    limits: MotionLimits
+    notices: tuple[str, ...]
+
+
 def build_motion_limits(
     robot: Robot, options: MotionOptions, plan_options: PlanOptions
-) -> tuple[MotionLimits, tuple[str, ...]]:
+) -> LimitsWithNotices:
     """What the motion may do, and notices.  Raises OptionError."""
     lower, upper, notices = find_joint_limits(robot, plan_options.joints)
     lower, upper = (np.where(robot.passive, 0.0, limit) for limit in (lower, upper))
@@ -343,7 +350,9 @@ def build_motion_limits(
     space = ArmWorkspace(robot, np.zeros((1, 3)), up, lower, upper, radius, plan_options.floor)
     scale = np.where(robot.prismatic, 1e-3 * 180.0 / np.pi, 1.0)  # degrees to mm
     box = np.array(plan_options.volume, dtype=float).reshape(-1, 3)
-    return MotionLimits(space, box, scale * options.speed, scale * options.acceleration), notices
+    return LimitsWithNotices(
+        MotionLimits(space, box, scale * options.speed, scale * options.acceleration), notices
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,7 +21,6 @@ from minimax_cal.planning.candidate_poses import (
     draw_visible_candidates,
 )
 from minimax_cal.planning.designs.design_exchange import (
-    ExperimentPool,
     find_largest_indices,
     improve_design_by_exchange,
     inverse_criterion_gradient,
@@ -33,7 +33,6 @@ from minimax_cal.planning.designs.design_search import (
     search_best_design,
 )
 from minimax_cal.planning.designs.optimality_criteria import (
-    OptimalityCriterion,
     invert_information_matrices,
 )
 from minimax_cal.planning.plan_options import PlanOptions, check_plan_options, plan_settings_record
@@ -44,6 +43,7 @@ from minimax_cal.planning.plan_predictions import (
     predict_effect_separation,
 )
 from minimax_cal.planning.planning_task import (
+    DesignProblem,
     PlanningTask,
     build_planning_inputs,
     build_planning_task,
@@ -146,9 +146,16 @@ def draw_enough_candidates(
     return found
 
 
+class RefinedCandidates(NamedTuple):
+    """Candidates, and the first choice among them."""
+
+    candidates: CandidatePoses
+    chosen_indices: Array
+
+
 def refine_candidates_near_best(
     task: PlanningTask, candidates: CandidatePoses, pose_count: int, progress: Progress
-) -> tuple[CandidatePoses, Array]:
+) -> RefinedCandidates:
     """More candidates around those that tell most, and a first choice.
 
     Where poses that can be seen are rare, the best of a sequence lie inside of what is allowed;
@@ -164,26 +171,26 @@ def refine_candidates_near_best(
         more, seen = draw_candidates_near_poses(
             task.workspace, task.visibility, candidates.q[chosen], each, step, rng
         )
-        menu, criterion = task.build_design_problem(candidates.add_candidates(more, seen))
-        cov = invert_information_matrices(menu.sum_information(chosen))
+        menu, criterion = task.build_design_problem(candidates.with_candidates(more, seen))
+        cov = invert_information_matrices(menu.information_of_experiments(chosen))
         fresh = menu.score_experiments(
             inverse_criterion_gradient(cov, criterion.equivalent_trace_weight(cov))
         )[candidates.count :]
         kept = np.sort(find_largest_indices(fresh, POSES_KEPT_PER_REFINEMENT))
         old = candidates.count
-        candidates = candidates.add_candidates(more[kept], seen[kept])
+        candidates = candidates.with_candidates(more[kept], seen[kept])
         menu = menu.select_experiments(np.concatenate([np.arange(old), old + kept]))
         among = np.union1d(np.arange(old, menu.experiment_count), chosen)
         chosen = improve_design_by_exchange(
             menu, criterion, chosen, among, ROUGH_EXCHANGE_SWEEPS
         ).experiment_indices
-    return candidates, chosen
+    return RefinedCandidates(candidates, chosen)
 
 
 def assemble_plan(
     task: PlanningTask,
     candidates: CandidatePoses,
-    design_problem: tuple[ExperimentPool, OptimalityCriterion],
+    design_problem: DesignProblem,
     best: DesignWithBound,
     notices: tuple[str, ...],
     start_seconds: float,
@@ -233,7 +240,7 @@ def assemble_plan(
         random=here.size[1],
         equal=equal,
         names=task.pose_information.names,
-        sigma=np.sqrt(np.diag(invert_information_matrices(menu.sum_information(chosen))))
+        sigma=np.sqrt(np.diag(invert_information_matrices(menu.information_of_experiments(chosen))))
         / task.pose_information.parameter_scale,
         indices=compare_observability_indices(
             task.pose_information, candidates, chosen, options.seed

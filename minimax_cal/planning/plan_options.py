@@ -10,13 +10,13 @@ from functools import partial
 import numpy as np
 
 from minimax_cal.core.errors import OptionError
-from minimax_cal.core.files import to_plain_json
+from minimax_cal.core.files import convert_to_plain_json
 from minimax_cal.core.option_fields import (
     SI_PER_OPTION_UNIT,
     check_seed,
     option_field_in_group,
     parse_low_high_range,
-    parse_triple_in_mm,
+    parse_millimetre_triple_to_metres,
 )
 from minimax_cal.planning.pose_information import PlanningNoise
 from minimax_cal.planning.pose_visibility import NORMAL_DIRECTIONS
@@ -96,7 +96,7 @@ class PlanOptions:
         (),
         "Where the tracker stands, in base axes, mm [default: 3 m before the arm].",
         metavar="X,Y,Z",
-        read=partial(parse_triple_in_mm, name="tracker"),
+        read=partial(parse_millimetre_triple_to_metres, name="tracker"),
     )
     targets: int = visibility_option(
         3, "The number of reflectors on a circle of 100 mm radius about the flange's axis."
@@ -106,7 +106,7 @@ class PlanOptions:
         "The place of a reflector in the flange's frame, mm; given once for each.",
         flag="--target",
         metavar="X,Y,Z",
-        read=partial(parse_triple_in_mm, name="spots"),
+        read=partial(parse_millimetre_triple_to_metres, name="spots"),
         many=tuple,
     )
     normals: str = visibility_option(
@@ -174,14 +174,14 @@ def parse_joint_limits(limit_texts: Sequence[str], robot: Robot) -> dict[int, tu
     """Limits by joint index, from texts as J2=-30:60.  Raises OptionError."""
     found: dict[int, tuple[float, float]] = {}
     for text in limit_texts:
-        index, limits = parse_joint_limit(text, robot)
+        index, limits = parse_joint_index_and_limits(text, robot)
         if index in found:
             raise OptionError(f"joints={text!r}: joint {index + 1} is given twice; give it once")
         found[index] = limits
     return found
 
 
-def parse_joint_limit(limit_text: str, robot: Robot) -> tuple[int, tuple[float, float]]:
+def parse_joint_index_and_limits(limit_text: str, robot: Robot) -> tuple[int, tuple[float, float]]:
     """J2=LOW:HIGH in degrees, slides in millimetres.  Raises OptionError."""
     match = JOINT_LIMIT_PATTERN.fullmatch(limit_text)
     if not match:
@@ -236,4 +236,4 @@ def check_plan_options(options: PlanOptions, pose_count: int, robot: Robot) -> N
 def plan_settings_record(options: PlanOptions, pose_count: int) -> dict[str, object]:
     """The options for the record."""
     joints = {str(joint): limits for joint, limits in options.joints.items()}
-    return {"poses": pose_count, **to_plain_json({**vars(options), "joints": joints})}
+    return {"poses": pose_count, **convert_to_plain_json({**vars(options), "joints": joints})}

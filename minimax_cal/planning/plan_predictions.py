@@ -17,7 +17,6 @@ from minimax_cal.planning.designs.design_search import (
     build_quick_design,
 )
 from minimax_cal.planning.designs.optimality_criteria import (
-    OptimalityCriterion,
     evaluate_information_matrices,
     invert_information_matrices,
 )
@@ -29,7 +28,7 @@ from minimax_cal.planning.plan_figures import (
     Separation,
     observability_indices,
 )
-from minimax_cal.planning.planning_task import PlanningTask
+from minimax_cal.planning.planning_task import DesignProblem, PlanningTask
 from minimax_cal.planning.pose_information import PoseInformation
 from minimax_cal.planning.visit_route import VisitSequence
 from minimax_cal.selection.thresholds import SUFFICIENT_SEPARATION_POWER
@@ -52,7 +51,7 @@ def predict_position_sigmas(
     prediction_squares: (w, f * f) B'B of each pose of the workspace.
     """
     cov = invert_information_matrices(
-        np.array([pool.sum_information(chosen) for chosen in designs])
+        np.array([pool.information_of_experiments(chosen) for chosen in designs])
     ).reshape(len(designs), -1)
     told = np.asarray(np.isfinite(cov).all(axis=1))
     variance = np.where(told[:, None], cov, 0.0) @ prediction_squares.T
@@ -63,7 +62,7 @@ def predict_position_sigmas(
 def predict_accuracy_by_pose_count(
     task: PlanningTask,
     parameter_pool: ExperimentPool,
-    design_problem: tuple[ExperimentPool, OptimalityCriterion],
+    design_problem: DesignProblem,
     best: DesignWithBound,
     random_candidate_count: int,
 ) -> tuple[Growth, ...]:
@@ -87,7 +86,8 @@ def predict_accuracy_by_pose_count(
             ),
         ]
         sizes = evaluate_information_matrices(
-            design_problem[1], np.array([design_problem[0].sum_information(one) for one in designs])
+            design_problem[1],
+            np.array([design_problem[0].information_of_experiments(one) for one in designs]),
         )
         both = predict_position_sigmas(parameter_pool, designs, squares)
         if not np.isfinite(both[0]).all() and count != poses:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -152,24 +153,40 @@ def check_same_robot(robot: Robot, calibrated_robot: Robot) -> None:
         )
 
 
-def build_assumed_cell(robot: Robot, options: PlanOptions) -> tuple[Cell, str]:
+class AssumedCell(NamedTuple):
+    """A cell that is assumed, and the sentence that says so."""
+
+    cell: Cell
+    notice: str
+
+
+def build_assumed_cell(robot: Robot, options: PlanOptions) -> AssumedCell:
     """A nominal robot before a tracker, and a notice where nobody said where that is."""
     spots = np.array(options.spots, dtype=float).reshape(-1, 3)
     spots = spots if len(spots) else target_positions_on_circle(options.targets)
     names = tuple(f"smr{i + 1}" for i in range(len(spots)))
     cell = Cell(robot, np.eye(4), names, spots)
     if len(options.tracker):
-        return place_measurement_frame(cell, np.array(options.tracker, dtype=float)), ""
+        return AssumedCell(
+            place_measurement_frame(cell, np.array(options.tracker, dtype=float)), ""
+        )
     away = max(DEFAULT_TRACKER_DISTANCE, robot.reach())
     place = default_tracker_position(cell, away)
     where = ", ".join(f"{1e3 * value:.0f}" for value in place)
     text = f"the tracker is taken to stand at {where} mm in base axes; say where with tracker="
-    return place_measurement_frame(cell, place), text
+    return AssumedCell(place_measurement_frame(cell, place), text)
+
+
+class NoiseWithSource(NamedTuple):
+    """Noise, and the sentence that says where it is from."""
+
+    noise: PlanningNoise
+    source_text: str
 
 
 def choose_planning_noise(
     cell: Cell, measurement_sets: Sequence[Measurements], options: PlanOptions
-) -> tuple[PlanningNoise, str]:
+) -> NoiseWithSource:
     """The noise to plan with, and where it is from."""
     given = {name: getattr(options, name) for name in ("noise", "per_metre", "jitter")}
     told = {name: float(value) for name, value in given.items() if value is not None}
@@ -187,7 +204,7 @@ def choose_planning_noise(
         f"noise of a coordinate {1e6 * out.noise:.3g} um + {1e6 * out.per_metre:.3g} um/m, jitter "
         f"of a joint {1e6 * out.jitter:.3g} urad{', as given' if told else source}"
     )
-    return out, text
+    return NoiseWithSource(out, text)
 
 
 def estimate_cell_noise(cell: Cell, measurements: Measurements) -> Noise:
@@ -207,9 +224,17 @@ def estimate_cell_noise(cell: Cell, measurements: Measurements) -> Noise:
     return estimate_noise_by_reml(rows, rows.rows_from_fields(fields))
 
 
+class PlanningSurroundings(NamedTuple):
+    """Where the arm may go, what the instrument sees, and notices."""
+
+    workspace: ArmWorkspace
+    visibility: TrackerVisibility
+    notices: tuple[str, ...]
+
+
 def build_workspace_and_visibility(
     cell: Cell, options: PlanOptions, measurement_sets: Sequence[Measurements] = ()
-) -> tuple[ArmWorkspace, TrackerVisibility, tuple[str, ...]]:
+) -> PlanningSurroundings:
     """Where the arm may go and what the instrument sees.  measurement_sets: poses at hand."""
     robot = cell.robot
     lower, upper, notices = find_joint_limits(robot, options.joints, measurement_sets)
@@ -225,7 +250,7 @@ def build_workspace_and_visibility(
     sight = TrackerVisibility(
         place, robot.up, options.acceptance, *options.reach, *options.elevation
     )
-    return room, sight, notices
+    return PlanningSurroundings(room, sight, notices)
 
 
 # ---- the task ------------------------------------------------------------------------------------
@@ -243,6 +268,13 @@ CRITERION_BUILDERS: Mapping[str, Callable[[PoseInformation, Array], OptimalityCr
     "G": lambda ahead, b: LargestVarianceCriterion(np.swapaxes(b, 1, 2) @ b),
     "I": lambda ahead, b: TraceCriterion(np.einsum("wri,wrj->ij", b, b) / len(b)),
 }
+
+
+class DesignProblem(NamedTuple):
+    """The experiments to choose from, and the criterion of the choice."""
+
+    pool: ExperimentPool
+    criterion: OptimalityCriterion
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,14 +316,15 @@ class PlanningTask:
             for one in self.questions
         )
 
-    def build_design_problem(
-        self, candidates: CandidatePoses
-    ) -> tuple[ExperimentPool, OptimalityCriterion]:
+    def build_design_problem(self, candidates: CandidatePoses) -> DesignProblem:
         """What is to be chosen from, and by what."""
         for contest in self.predict_separation_powers(candidates):
-            return contest.pool, contest.criterion
-        return self.build_parameter_pool(candidates), CRITERION_BUILDERS[self.options.criterion](
-            self.pose_information, self.position_predictions
+            return DesignProblem(contest.pool, contest.criterion)
+        return DesignProblem(
+            self.build_parameter_pool(candidates),
+            CRITERION_BUILDERS[self.options.criterion](
+                self.pose_information, self.position_predictions
+            ),
         )
 
     def find_target_indices(self, question: SeparationQuestion) -> list[int]:

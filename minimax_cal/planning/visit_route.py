@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -58,11 +59,19 @@ def order_poses_for_short_path(q: Array, is_prismatic: Array, start_q: Array) ->
         way[one : other + 1] = way[one : other + 1][::-1].copy()
 
 
-def find_best_path_reversal(distances: Array, path_order: Array) -> tuple[int, int, float]:
+class PathReversal(NamedTuple):
+    """Ends of the stretch of a path that is reversed, and by how much the path gets shorter."""
+
+    first: int
+    last: int
+    shortening: float
+
+
+def find_best_path_reversal(distances: Array, path_order: Array) -> PathReversal:
     """Which stretch of an open way to turn round, and by how much it gets shorter."""
     m = len(path_order)
     if m < 3:
-        return 0, 0, 0.0
+        return PathReversal(0, 0, 0.0)
     before, first = (
         path_order[:-1],
         path_order[1:],
@@ -76,7 +85,7 @@ def find_best_path_reversal(distances: Array, path_order: Array) -> tuple[int, i
     )
     gain = np.triu(now[:, None] + out[None] - joined, 1)
     one, other = np.unravel_index(int(np.argmax(gain)), gain.shape)
-    return int(one) + 1, int(other) + 1, float(gain[one, other])
+    return PathReversal(int(one) + 1, int(other) + 1, float(gain[one, other]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,9 +158,16 @@ def last_move_signs(q: Array) -> Array:
 RADIANS_TO_ANGLE_UNIT = {"deg": 180.0 / np.pi, "rad": 1.0}  # units of turning joints in a file
 
 
+class CsvRows(NamedTuple):
+    """Header and rows of a CSV file."""
+
+    header: list[str]
+    rows: list[list[TableCell]]
+
+
 def build_stop_rows(
     visits: VisitSequence, cell: Cell, expected_positions: Array, angle_unit: str
-) -> tuple[list[str], list[list[TableCell]]]:
+) -> CsvRows:
     """Header and rows: visit number, pose, joints, sides, and where the targets should be seen.
 
     expected_positions: (N, k, 3) [m].  angle_unit: of turning joints; slides are in millimetres.
@@ -177,7 +193,7 @@ def build_stop_rows(
         there = expected_positions[pose].reshape(-1) * (np.nan if visits.via[stop] else 1e3)
         row += [float(value) for value in there]
         rows.append(row)
-    return header, rows
+    return CsvRows(header, rows)
 
 
 def format_rounded_csv(header: Sequence[str], rows: Sequence[Sequence[TableCell]]) -> str:

@@ -6,7 +6,7 @@ import sys
 from importlib.util import find_spec
 from pathlib import Path
 
-from minimax_cal.core.display_text import shorten_to_one_line
+from minimax_cal.core.display_text import clean_and_shorten_to_one_line
 from minimax_cal.core.errors import DataError
 from minimax_cal.core.files import MAX_FILE_BYTES
 from minimax_cal.core.optional_packages import install_command
@@ -39,7 +39,7 @@ def read_workbook_as_text(path: Path) -> str:
     done = subprocess.run([sys.executable, "-P", program, path], capture_output=True, check=False)
     if done.returncode:
         told = (
-            shorten_to_one_line(done.stderr.decode(errors="replace"))
+            clean_and_shorten_to_one_line(done.stderr.decode(errors="replace"))
             if done.returncode == 1
             else ""
         )

@@ -11,7 +11,7 @@ from datetime import date as Date
 from pathlib import Path
 
 from minimax_cal.core.errors import OptionError
-from minimax_cal.core.files import check_writable, write_file_atomically
+from minimax_cal.core.files import check_output_path, write_file_atomically
 from minimax_cal.core.option_fields import option_field_in_group, take_option_fields_as_keywords
 from minimax_cal.fitting.options import split_names
 from minimax_cal.reporting.html import (
@@ -33,7 +33,7 @@ from minimax_cal.reporting.html.motion_report import (
     find_motion_diagnosis,
 )
 from minimax_cal.reporting.html.report_sources import ReportableResult
-from minimax_cal.validation.tolerance import parse_claim_name, parse_limits
+from minimax_cal.validation.tolerance import parse_claim_name, parse_tolerance_limits
 
 requirement_option, report_text_option = (
     option_field_in_group("What is required"),
@@ -92,7 +92,7 @@ class ReportOptions:
         title, customer, author, date = (
             getattr(self, name) or told.get(name, "") for name in REPORT_TEXT_KEYS
         )
-        limits, which = parse_limits(self.tolerance), parse_claim_name(self.tolerance_for)
+        limits, which = parse_tolerance_limits(self.tolerance), parse_claim_name(self.tolerance_for)
         more = (self.rung, self.deliver, self.appendix)
         return ReportRequest(
             resolve_report_date(date), title, customer, author, told, limits, which, *more
@@ -152,11 +152,11 @@ def write_report(
     notify: Callable[[str], object],
 ) -> ReportJudgement | MotionReportSource:
     """Write the report; what it judges."""
-    check_writable(path, (*HTML_SUFFIXES, *PDF_SUFFIXES, *PNG_SUFFIXES))
+    check_output_path(path, (*HTML_SUFFIXES, *PDF_SUFFIXES, *PNG_SUFFIXES))
     import_report_packages()
     wording = options.build_request()
     if pdf is not None:
-        check_writable(pdf, PDF_SUFFIXES)
+        check_output_path(pdf, PDF_SUFFIXES)
     suffix = Path(path).suffix.lower()
     browser = find_browser() if pdf is not None or suffix not in HTML_SUFFIXES else ""
     if not isinstance(results, Sequence) or isinstance(results, str):

@@ -11,7 +11,7 @@ from scipy.linalg import solve_triangular
 from scipy.special import fdtrc
 
 from minimax_cal.core.arrays import Array
-from minimax_cal.core.linear_algebra import column_scales, scale_symmetric
+from minimax_cal.core.linear_algebra import column_norms_from_gram, divide_by_scales
 from minimax_cal.selection.candidate_library import (
     CandidateLibrary,
     EqualShapeCandidates,
@@ -303,7 +303,7 @@ class CandidateTests:
         across = candidate_fit.values @ both[:d, d:]
         own = np.diag(both)[d:]  # zero where geometry imitates a column
         scale = np.sqrt(np.maximum(own, 1e-12 * own.max(initial=0.0) + 1e-300))
-        inverse = np.linalg.pinv(scale_symmetric(both[d:, d:], scale), 1e-9, hermitian=True)
+        inverse = np.linalg.pinv(divide_by_scales(both[d:, d:], scale), 1e-9, hermitian=True)
         shared = float((across / scale) @ inverse @ (across / scale))
         return size / candidate_fit.noise_variance, min(shared / max(size, 1e-300), 1.0)
 
@@ -497,8 +497,8 @@ def build_normal_equations(
     )
     gram, pull = whole[:-1, :-1], whole[:-1, -1]
     gram = gram + np.diag(np.pad(ridge * noise.variance, (len(main), 0)))
-    scale = column_scales(gram)
-    return scale_symmetric(gram, scale), pull / scale, scale
+    scale = column_norms_from_gram(gram)
+    return divide_by_scales(gram, scale), pull / scale, scale
 
 
 def deviance_of_sign_constraints(

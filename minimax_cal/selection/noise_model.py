@@ -20,7 +20,7 @@ from typing import Self
 import numpy as np
 
 from minimax_cal.core.arrays import Array
-from minimax_cal.core.linear_algebra import column_scales, project_out, scale_symmetric
+from minimax_cal.core.linear_algebra import column_norms_from_gram, divide_by_scales, project_out
 from minimax_cal.selection.thresholds import MIN_NOISE_DEGREES_OF_FREEDOM
 
 SEARCHED_NOISE_RATIOS = np.concatenate(
@@ -152,7 +152,7 @@ def identifiable_combinations(gram: Array) -> Array:
     """(p, r) combinations of parameters that turn a Gram matrix (p, p) into 1."""
     norm = np.sqrt(np.diag(gram))
     used = norm > 0.0
-    whole = distinguishable_combinations(scale_symmetric(gram[np.ix_(used, used)], norm[used]))
+    whole = distinguishable_combinations(divide_by_scales(gram[np.ix_(used, used)], norm[used]))
     out = np.zeros((len(gram), whole.shape[1]))
     out[used] = whole / norm[used][:, None]
     return out
@@ -271,7 +271,7 @@ def restricted_deviances(
 
 def robust_cholesky_factors(grams: Array) -> Array:
     """(s, f, f) lower triangles whose squares are matrices (s, f, f), as near as those allow."""
-    scale = column_scales(grams)[..., None]
+    scale = column_norms_from_gram(grams)[..., None]
     unit = grams / scale / np.swapaxes(scale, 1, 2)
     try:
         return np.asarray(scale * np.linalg.cholesky(unit))

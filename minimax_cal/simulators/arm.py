@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -167,30 +167,41 @@ def fit_springs(
     change = inverse @ (right - np.einsum("el,elr->r", sizes, fields))
     values = dict(zip(kinds, (float(c) if c > MIN_COMPLIANCE else 0.0 for c in soft), strict=True))
     held = {
-        "joint_compliances": np.array([values.get(("joint", j), 0.0) for j in range(scene.joints)]),
+        "joint_compliances": np.array(
+            [values.get(CompliantPlace("joint", j), 0.0) for j in range(scene.joints)]
+        ),
         "link_flexibility": {i: c for (kind, i), c in values.items() if kind == "link" and c > 0.0},
-        "base_compliance": values.get(("base", 0), 0.0), "mass": mass, "com": com,
+        "base_compliance": values.get(CompliantPlace("base", 0), 0.0),
+        "mass": mass,
+        "com": com,
         "remaining_rms": 1e-3 * float(np.sqrt((rest**2).sum() / points)),
-    }  # fmt: skip
+    }
     *turns, drawn = np.append(change[tool:], np.zeros(9))[:9].tolist()
     sag = (TRACELESS_BASIS @ turns).reshape(3, 3)
     return FittedSprings(held, sag, drawn, change[:count], change[count:tool])
 
 
-def list_compliant_places(scene: PosedArm, laws: Fitted) -> list[tuple[str, int]]:
+class CompliantPlace(NamedTuple):
+    """What gives way: the kind of its spring, and the number of its joint or link."""
+
+    spring_kind: str
+    place_index: int
+
+
+def list_compliant_places(scene: PosedArm, laws: Fitted) -> list[CompliantPlace]:
     """What gives way: joints, links, the base; for a whole arm all joints that turn."""
-    out: dict[tuple[str, int], None] = {}
+    out: dict[CompliantPlace, None] = {}
     for term in laws.terms:
         if "parts" in term.choice:
             joints = [part // 4 for part in bit_mask_to_numbers(term.choice["parts"])]
             out |= {
-                ("joint", j): None
+                CompliantPlace("joint", j): None
                 for j in (find_driven_revolute_joints(scene) if term.place == "all" else joints)
             }
         elif term.place[0] == "L":
-            out[("link", joint_index_from_place(term.place))] = None
+            out[CompliantPlace("link", joint_index_from_place(term.place))] = None
         elif EFFECTS[term.effect].moves == "foot":
-            out[("base", 0)] = None
+            out[CompliantPlace("base", 0)] = None
     return list(out)
 
 
@@ -209,14 +220,14 @@ def first_moments(mass: Array, com: Array) -> Array:
     return np.concatenate([mass[:, None], mass[:, None] * com], axis=1).reshape(-1)
 
 
-def displacement_per_first_moment(scene: PosedArm, kind: str, index: int) -> Array:
+def displacement_per_first_moment(scene: PosedArm, spring_kind: str, place_index: int) -> Array:
     """(4 n, k, 3, m) displacement of a spring of compliance 1, for each mass and first moment."""
     verbs: dict[str, Callable[..., Array]] = {
-        "joint": partial(displacement_by_joint_torque, joint=index),
-        "link": partial(link_bending_displacement, link=index),
+        "joint": partial(displacement_by_joint_torque, joint=place_index),
+        "link": partial(link_bending_displacement, link=place_index),
         "base": base_tilt_displacement,
     }
-    verb = verbs[kind]
+    verb = verbs[spring_kind]
     out, n = [], scene.joints
     for mass in np.eye(n):
         centres = (np.outer(mass, axis) for axis in np.eye(4)[:, 1:])
@@ -234,6 +245,14 @@ def displacement_by_joint_torque(
     )
 
 
+class SpringFit(NamedTuple):
+    """Compliances (e,), masses (n,) and their centres (n, 3) that imitate displacements best."""
+
+    compliances: Array
+    masses: Array
+    centres: Array
+
+
 def fit_compliances_and_masses(
     displacement_fields: Array,
     displacement: Array,
@@ -241,7 +260,7 @@ def fit_compliances_and_masses(
     spring_kinds: Sequence[str],
     masses: LinkMasses,
     point_count: float,
-) -> tuple[Array, Array, Array]:
+) -> SpringFit:
     """Compliances, masses and centres that imitate displacements best [mm].
 
     displacement_fields: (e, 4 n, rows) per unit of compliance and moment.  displacement: (rows,).
@@ -287,7 +306,7 @@ def fit_compliances_and_masses(
     found = scipy.optimize.least_squares(
         residual, start, jacobian, bounds=(start - ends, start + ends), max_nfev=300
     )
-    return split(found.x)
+    return SpringFit(*split(found.x))
 
 
 # ---- the arm -------------------------------------------------------------------------------------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -59,10 +59,20 @@ class ModelServos:
     gravity_free: bool = False
 
     @staticmethod
-    def none(joint_count: int) -> ModelServos:
+    def zeros(joint_count: int) -> ModelServos:
         """Of a new file."""
         zeros, limits = np.zeros(joint_count), np.array([[-np.inf, np.inf]] * joint_count)
         return ModelServos(zeros, zeros, zeros, limits, np.ones(joint_count, dtype=bool))
+
+
+class SimulationData(NamedTuple):
+    """MuJoCo, a model, new data of it, and (n,) where the joints are in qpos and in forces."""
+
+    mujoco: Any
+    model: Any
+    data: Any
+    qpos_indices: Array
+    dof_indices: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +96,7 @@ class ModelArm:
         self.model.opt.disableflags |= int(import_mujoco().mjtDisableBit.mjDSBL_CONTACT)
 
     @staticmethod
-    def find(given: MjcfModel, joint_count: int, tip: str = "") -> ModelArm:
+    def find_in_model(given: MjcfModel, joint_count: int, tip: str = "") -> ModelArm:
         """The arm of so many joints in a model's file.  tip: its last body.  Raises RobotError."""
         model = given.compile_model()
         return find_model_arm(
@@ -118,10 +128,12 @@ class ModelArm:
         """Of time [s]."""
         return float(self.model.opt.timestep)
 
-    def new_data(self) -> tuple[Any, Any, Any, Array, Array]:
+    def create_data_with_indices(self) -> SimulationData:
         """MuJoCo, the model, new data of it, and (n,) where joints are in qpos and in forces."""
         mj = import_mujoco()
-        return mj, self.model, mj.MjData(self.model), self.qpos_indices, self.dof_indices
+        return SimulationData(
+            mj, self.model, mj.MjData(self.model), self.qpos_indices, self.dof_indices
+        )
 
     def with_model(self, model: Any) -> ModelArm:
         """The same joints in another compiled model, whose bodies stand where they did."""
@@ -204,7 +216,7 @@ class ModelArm:
         servos = self.read_servos()
         if servos.gravity_free:
             return
-        mj, model, data, at, dofs = self.new_data()
+        mj, model, data, at, dofs = self.create_data_with_indices()
         for row in q:
             data.qpos[at] = row
             mj.mj_forward(model, data)
@@ -220,7 +232,7 @@ class ModelArm:
                     "limit (forcerange), or mend the masses"
                 )
 
-    def find_filtered_servos(self) -> str:
+    def name_joints_with_filtered_commands(self) -> str:
         """The joints whose servos filter their commands, in words; empty where none does."""
         is_filtered = self.model.actuator_dyntype[self.servo_ids] * (self.servo_ids >= 0) > 0
         return ", ".join(np.array(self.joint_names)[is_filtered])
@@ -236,12 +248,12 @@ class ModelArm:
             )
         return replace(self.robot, up=self.robot.up * self.gravity / STANDARD_GRAVITY)
 
-    def find_feed_forward(self) -> dict[int, int]:
+    def find_feed_forward_joints_by_actuator(self) -> dict[int, int]:
         """Ids of actuators that take the commanded speed of a joint, and which joint (from 0)."""
         ids = (find_id(self.model, "ACTUATOR", f"{name}_ahead") for name in self.joint_names)
         return {number: j for j, number in enumerate(ids) if number >= 0}
 
-    def find_plays(self) -> dict[int, int]:
+    def find_play_qpos_by_joint(self) -> dict[int, int]:
         """Joints (from 0) whose gear has play, and where the position in it is in qpos."""
         ids = (find_id(self.model, "JOINT", f"play{i + 1}") for i in range(len(self.joint_ids)))
         return {i: int(self.model.jnt_qposadr[k]) for i, k in enumerate(ids) if k >= 0}
@@ -264,7 +276,7 @@ class ModelArm:
 
     def compute_data_at_zero(self) -> Any:
         """The model's data with the arm at joint values 0, all else as the file has it."""
-        mj, model, data, at, _ = self.new_data()
+        mj, model, data, at, _ = self.create_data_with_indices()
         data.qpos[at] = 0.0
         mj.mj_kinematics(model, data)
         return data
@@ -274,9 +286,9 @@ class ModelArm:
         data = self.compute_data_at_zero()
         return np.array([body_pose(data, body) for body in range(self.model.nbody)])
 
-    def find_largest_inertias(self) -> Array:
+    def largest_inertias_over_workspace(self) -> Array:
         """(n,) about each joint, its motor's with it, all over the workspace [kg m^2]."""
-        mj, model, data, at, dofs = self.new_data()
+        mj, model, data, at, dofs = self.create_data_with_indices()
         column, out = np.zeros(model.nv), np.zeros(len(dofs))
         for row in random_joint_values(self.robot, (INERTIA_SAMPLES,), np.random.default_rng(0)):
             data.qpos[at] = row
@@ -308,7 +320,7 @@ def find_model_arm(
         )
     return build_model_arm(
         model,
-        find_arm_joints(model, joint_count, source, tip_name),
+        find_arm_joint_ids(model, joint_count, source, tip_name),
         source,
         has_assumed_masses=has_assumed_masses,
     )
@@ -350,7 +362,7 @@ def find_id(model: Any, kind: str, name: str) -> int:
     )
 
 
-def find_arm_joints(model: Any, joint_count: int, source: str, tip_name: str) -> tuple[int, ...]:
+def find_arm_joint_ids(model: Any, joint_count: int, source: str, tip_name: str) -> tuple[int, ...]:
     """Ids of the joints from the foot to the tip, or of the only arm of so many joints.
 
     Where more lie on the way, those that an actuator drives; of several the driven arm.

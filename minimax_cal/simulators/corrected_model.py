@@ -92,7 +92,7 @@ def correct_model(
     document = given.document.copy()
     tree = MjcfTree(document.root)
     calibrated = (arm.robot, base @ arm.mount) if arm else (nominal, base)
-    layout = move_bodies(tree, chain, (nominal, base), calibrated)
+    layout = move_bodies_and_build_layout(tree, chain, (nominal, base), calibrated)
 
     # Masses: a model keeps its own, but for a file of ours that assumes them.
     if arm and chain.has_assumed_masses:
@@ -126,11 +126,11 @@ def correct_model(
         nominal, link_masses_and_centres(chain.robot, MIN_SIMULATED_LINK_MASS)
     )
     write_arm_elements(layout, held, target_names or None, with_servos=with_servos)
-    lengthen_keyframes(given, tree.root, chain.model)
+    add_springs_to_keyframes(given, tree.root, chain.model)
     return CorrectedModel(document, base, tuple(notices))
 
 
-def move_bodies(
+def move_bodies_and_build_layout(
     tree: MjcfTree, chain: ModelArm, nominal: PlacedRobot, calibrated: PlacedRobot
 ) -> ArmLayout:
     """Move the bodies of a tree to where the calibrated robot has them; its layout from then on.
@@ -174,10 +174,10 @@ def move_bodies(
         body.attrib |= pose_attributes(pose)
     return ArmLayout(tree, chain.joint_names, tuple(bodies), tuple(joints), np.array(seats),
                   model.jnt_pos[ids], model.jnt_axis[ids], chain.read_servos(),
-                  chain.find_largest_inertias(), chain.timestep)  # fmt: skip
+                  chain.largest_inertias_over_workspace(), chain.timestep)  # fmt: skip
 
 
-def lengthen_keyframes(given: MjcfModel, tree: ET.Element, model: Any) -> None:
+def add_springs_to_keyframes(given: MjcfModel, tree: ET.Element, model: Any) -> None:
     """Give the springs that a tree has now their places in its keyframes, at 0.
 
     model: as it was.

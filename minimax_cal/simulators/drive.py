@@ -18,13 +18,13 @@ from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Lock
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from minimax_cal.core.arrays import Array
 from minimax_cal.core.errors import CalibrationError, RobotError
-from minimax_cal.core.files import read_saved_json
+from minimax_cal.core.files import read_saved_result_json
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell, build_measurements_at_rest, cell_from_dict
 from minimax_cal.robots.kinematics import rotation_from_vector, skew_matrix
@@ -77,7 +77,7 @@ def load_commands(path: Path | str) -> Commands:
     --------
     >>> data.ctrl[:] = mc.load_commands("arm.commands.json")(q)
     """
-    content = read_saved_json(path)
+    content = read_saved_result_json(path)
     if content.get("kind") != "commands" or "cell" not in content:
         raise CalibrationError(
             f"{path}: is no command map; an export to mjcf writes one where it is needed"
@@ -169,8 +169,8 @@ def drive_run(
     """A run of moves, one after the other, with a model of its own: a row each of `DrivenPoses`."""
     chain = replace(chain, model=copy(chain.model))
     (mj, model, data, at, dofs), plays, carrier = (
-        chain.new_data(),
-        chain.find_plays(),
+        chain.create_data_with_indices(),
+        chain.find_play_qpos_by_joint(),
         chain.target_body,
     )
     joints, servos, moved = (
@@ -252,10 +252,10 @@ def set_joints_without_servos(
     chain: ModelArm, commands: Array, play_positions: Array | None
 ) -> DrivenPoses:
     """The same for a model without servos: its joints are set and nothing moves."""
-    (mj, model, data, at, _), out = chain.new_data(), []
+    (mj, model, data, at, _), out = chain.create_data_with_indices(), []
     for row in range(len(commands)):
         data.qpos[at] = commands[row]
-        for joint, place in chain.find_plays().items():
+        for joint, place in chain.find_play_qpos_by_joint().items():
             data.qpos[place] = 0.0 if play_positions is None else play_positions[row, joint]
         mj.mj_kinematics(model, data)
         out.append(body_pose(data, chain.target_body))
@@ -314,7 +314,11 @@ def find_target_positions_at_rest(
     commands: (m, n) [rad, m].  play_positions: (m, n) where each joint rests in its play [rad].
     """
     chain = replace(chain, model=copy(chain.model))
-    (mj, model, data, *_), sides, servos = chain.new_data(), chain.find_plays(), chain.servo_ids
+    (mj, model, data, *_), sides, servos = (
+        chain.create_data_with_indices(),
+        chain.find_play_qpos_by_joint(),
+        chain.servo_ids,
+    )
     joints = list(find_joint_path_to_body(model, int(model.site(target_names[0]).bodyid[0])))
     at, dofs = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
     states = model.actuator_actadr[servos]
@@ -387,9 +391,16 @@ def compute_error_with_fitted_base(
     return error
 
 
+class BaseAndTargetColumns(NamedTuple):
+    """Errors (m, k, 3) and their derivatives (m, k, 3, 6 + 3 k) by base and targets."""
+
+    error: Array
+    columns: Array
+
+
 def linearise_base_and_targets(
     poses: Array, y: Array, base_rotation: Array, base_origin: Array, target_positions: Array
-) -> tuple[Array, Array]:
+) -> BaseAndTargetColumns:
     """Errors (m, k, 3) and their columns (m, k, 3, 6 + 3 k): shift, turn of the base; targets."""
     inside = np.einsum("mij,kj->mki", poses[:, :3, :3], target_positions) + poses[:, None, :3, 3]
     error = y - inside @ base_rotation.T - base_origin
@@ -399,4 +410,4 @@ def linearise_base_and_targets(
     columns[..., 3:6] = -base_rotation @ skew_matrix(inside)
     for i in range(k):
         columns[:, i, :, 6 + 3 * i : 9 + 3 * i] = base_rotation @ poses[:, :3, :3]
-    return error, columns
+    return BaseAndTargetColumns(error, columns)

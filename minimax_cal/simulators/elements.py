@@ -206,7 +206,7 @@ def write_servos(layout: ArmLayout, arm: SimulatedArm, servos: ServoDesign) -> N
     couplings = ET.Element("tendon")
     for i, name in enumerate(layout.joint_names):
         # Gain and damper at the motor, whose gear holds the encoder's gain.
-        servo = tree.find_servo(name)
+        servo = tree.servo_or_new(name)
         gear = 1.0 / (1.0 + arm.encoder_gains[i])
         if not servos.is_kept[i] or arm.encoder_gains[i]:
             damper = servos.damper[i]
@@ -215,13 +215,13 @@ def write_servos(layout: ArmLayout, arm: SimulatedArm, servos: ServoDesign) -> N
                 damper = 0.0
             damper = max(damper - given.joint_damping[i], 0.0) / gear**2
             set_servo_gains(servo, servos.gain[i] / gear**2, damper)
-        tree.remove("custom", "text", f"{name}_deflection")  # of a calibration before
+        tree.remove_elements("custom", "text", f"{name}_deflection")  # of a calibration before
         if arm.joint_compliances[i] > NEGLIGIBLE_COMPLIANCE and not servos.is_sprung[i]:
             text = (
                 f"the gain of {servo.get('name')} is a spring: under gravity {name} turns by "
                 f"{arm.joint_compliances[i]:.6g} rad/(N m); another gain is another deflection"
             )
-            set_element(tree.section("custom"), "text", f"{name}_deflection", data=text)
+            set_element(tree.section_or_new("custom"), "text", f"{name}_deflection", data=text)
         if arm.encoder_gains[i]:
             servo.set("gear", format_exact_numbers([gear]))
 
@@ -239,7 +239,7 @@ def write_servos(layout: ArmLayout, arm: SimulatedArm, servos: ServoDesign) -> N
             servo.attrib.pop("joint", None)
             servo.set("tendon", f"{name}_drive")
     if len(couplings):
-        tree.section("tendon").extend(couplings)
+        tree.section_or_new("tendon").extend(couplings)
 
 
 def set_servo_gains(servo: ET.Element, gain: float, damper: float) -> None:
@@ -258,7 +258,7 @@ def add_spring(
     body: ET.Element,
     name: str,
     kind: str,
-    at: Array,
+    origin: Array,
     axis: Array,
     stiffness: float,
     inertia: float,
@@ -267,12 +267,12 @@ def add_spring(
 ) -> ET.Element:
     """A passive joint with a spring, the last of its body's joints.
 
-    kind: hinge or slide.  at, axis: (3,) in the body.  feels_all_gravity: or as much as the
+    kind: hinge or slide.  origin, axis: (3,) in the body.  feels_all_gravity: or as much as the
     actuators do.
     """
     damping = SPRING_TIME * stiffness + 2.0 * np.sqrt(stiffness * inertia)  # comes to rest
     new = ET.Element("joint", format_attributes({
-        "name": name, "type": kind, "pos": at, "axis": axis, "stiffness": [stiffness],
+        "name": name, "type": kind, "pos": origin, "axis": axis, "stiffness": [stiffness],
         "springref": "0", "ref": "0", "limited": "false", "damping": [damping],
         "frictionloss": "0", "armature": [SPRING_INERTIA * inertia]
     }))  # fmt: skip
@@ -376,8 +376,13 @@ def write_balancer(layout: ArmLayout, arm: SimulatedArm, stiffness: float) -> No
     points = {"anchor": start + BALANCER_ANCHOR * side,
               "eye": start + BALANCER_ANCHOR * balance.eye_distance * along}  # fmt: skip
     pull = -balance.stiffness_law * stiffness / (balance.eye_distance * BALANCER_ANCHOR**2)
-    tendon = add_element(layout.tree.section("tendon"), "spatial", name="balancer", stiffness=pull,
-                         springlength=balance.rest_length * BALANCER_ANCHOR)  # fmt: skip
+    tendon = add_element(
+        layout.tree.section_or_new("tendon"),
+        "spatial",
+        name="balancer",
+        stiffness=pull,
+        springlength=balance.rest_length * BALANCER_ANCHOR,
+    )
     for i, (name, point) in enumerate(points.items()):
         inside = layout.joint_frames[i] @ invert_transform(at[i])
         add_element(layout.bodies[i], "site", name=f"balancer_{name}",

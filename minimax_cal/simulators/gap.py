@@ -6,12 +6,13 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from minimax_cal.core.arrays import Array
 from minimax_cal.core.errors import OptionError
-from minimax_cal.core.files import check_writable, to_plain_json, write_file_atomically
+from minimax_cal.core.files import check_output_path, convert_to_plain_json, write_file_atomically
 from minimax_cal.diagnosing.diagnose import diagnose
 from minimax_cal.diagnosing.diagnosis import Diagnosis, load_diagnosis
 from minimax_cal.fitting.accuracy import summarise_point_errors
@@ -252,12 +253,12 @@ def simulator_gap(
     began = time.perf_counter()
     check_holdout_and_seed(holdout, seed)
     if write is not None:
-        check_writable(write, MJCF_SUFFIXES)
+        check_output_path(write, MJCF_SUFFIXES)
     import_mujoco()
     progress("reading the model")
     rows = read_measurements(data)
     given = read_mujoco_model(model)
-    chain = ModelArm.find(given, rows.q.shape[1], tip)
+    chain = ModelArm.find_in_model(given, rows.q.shape[1], tip)
     check_and_complete_joints(chain.robot, rows)
     if (chain.servo_ids >= 0).all():  # before anything that takes long
         chain.check_force_limits(rows.q, given.source)
@@ -284,7 +285,7 @@ def simulator_gap(
         train_poses=int((~causes.is_held_out).sum()),
         holdout_poses=int(run.held.sum()),
         status=best.status,
-        beyond=to_plain_json(best.beyond),
+        beyond=convert_to_plain_json(best.beyond),
         left_out=tuple(run.left_out),
         notices=tuple(dict.fromkeys(notices)),
         written="" if path is None else str(path),
@@ -292,6 +293,20 @@ def simulator_gap(
         provenance=Provenance.from_run(chain.robot, rows, {"model": str(model), "holdout": holdout,
                                                      "seed": seed}),
     )  # fmt: skip
+
+
+class CorrectionSteps(NamedTuple):
+    """Steps of a ladder, and the fit of the last."""
+
+    steps: list[GapStep]
+    fit: Fit
+
+
+class WrittenModelSteps(NamedTuple):
+    """The step of a written file, and of the file with a command map, if there is one."""
+
+    step: GapStep
+    step_with_command_map: GapStep | None
 
 
 class GapLadder:
@@ -331,13 +346,15 @@ class GapLadder:
             return [replace(first, why="joints set, not driven")]
         made = self.correct_given_model(None, self.nominal)
         self.notices += made.notices
-        stiff = self.measure_step("servo sag removed", self.compile_document(made.document))
+        stiff = self.measure_step(
+            "servo sag removed", self.write_and_compile_document(made.document)
+        )
         return [
             replace(first, why=f"servos sag by up to {first.sag_mrad:.3g} mrad"),
             replace(stiff, why="gains that hold the arm where it is commanded"),
         ]
 
-    def measure_corrections(self) -> tuple[list[GapStep], Fit]:
+    def measure_corrections(self) -> CorrectionSteps:
         """A rung for geometry, and each effect that the simulator holds and gains by; their fit.
 
         Each is fitted with those before it and with nothing else: the values of a fit hold
@@ -362,11 +379,11 @@ class GapLadder:
                 continue
             fit, taken = more, [*taken, term]
             rungs.append(rung)
-        return rungs, fit
+        return CorrectionSteps(rungs, fit)
 
     def measure_written_model(
         self, last_step: GapStep, fit: Fit, path: Path | None
-    ) -> tuple[GapStep, GapStep | None]:
+    ) -> WrittenModelSteps:
         """The last rung from its file, with targets, and what a command map does.
 
         The arm with a command map is another one, in a file of its own: what commands take over
@@ -375,14 +392,16 @@ class GapLadder:
         arm, with_map = self.build_arm(fit), None
         made = self.correct_given_model(arm, fit.cell)
         rung = self.measure_step(
-            last_step.name, self.compile_document(made.document, path), arm, fit
+            last_step.name, self.write_and_compile_document(made.document, path), arm, fit
         )
         if self.mapped:
             fit = self.causes.fit_terms([*fit.cell.effects.terms, *self.mapped])
             arm = self.build_arm(fit)
         if arm.mapped_effects.terms:
             model = None if path is None else path.with_suffix(COMMANDED_MODEL_ENDING)
-            chain = self.compile_document(self.correct_given_model(arm, fit.cell).document, model)
+            chain = self.write_and_compile_document(
+                self.correct_given_model(arm, fit.cell).document, model
+            )
             if path is not None:
                 for ending, content in arm.format_command_map(fit.cell).items():
                     write_file_atomically(path.with_suffix(ending), content)
@@ -395,9 +414,11 @@ class GapLadder:
         self.left_out += arm.left_out
         whole = replace(arm, remaining_rms=0.0, left_out=tuple(self.left_out))
         self.notices += (*made.notices, *whole.list_limitations())
-        return replace(rung, why=last_step.why), with_map
+        return WrittenModelSteps(replace(rung, why=last_step.why), with_map)
 
-    def compile_document(self, document: XmlDocument, path: Path | None = None) -> ModelArm:
+    def write_and_compile_document(
+        self, document: XmlDocument, path: Path | None = None
+    ) -> ModelArm:
         """The arm in a changed document, from the file where one is written."""
         if path is None:
             return self.chain.with_model(self.given.compile_model(document.root))
@@ -415,7 +436,10 @@ class GapLadder:
         """The simulator with the arm of a fit."""
         arm = self.build_arm(fit)
         return self.measure_step(
-            name, self.compile_document(self.correct_given_model(arm, fit.cell).document), arm, fit
+            name,
+            self.write_and_compile_document(self.correct_given_model(arm, fit.cell).document),
+            arm,
+            fit,
         )
 
     def correct_given_model(self, arm: SimulatedArm | None, cell: Cell) -> CorrectedModel:

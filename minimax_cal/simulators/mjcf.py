@@ -13,6 +13,7 @@ from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
+from typing import NamedTuple
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -43,7 +44,7 @@ ROD_RADIUS = 0.02  # of the links that are drawn [m]
 NEW_TIMESTEP = 0.002  # of a new file [s]
 
 
-def write(job: ExportJob) -> ExportedFile:
+def build_mjcf_file(job: ExportJob) -> ExportedFile:
     """A new MJCF, or the given one corrected; a command map beside it where effects need one.
 
     A given model keeps its own masses, unless those are assumed.
@@ -64,7 +65,7 @@ def write(job: ExportJob) -> ExportedFile:
                 f"{job.source}: mjcf= is corrected by a calibration: give one, not a robot"
             )
         cell, given = job.cell, read_mujoco_model(job.model)
-        chain = ModelArm.find(given, job.robot.joints, job.tip)
+        chain = ModelArm.find_in_model(given, job.robot.joints, job.tip)
         arm = build_simulated_arm(cell, job.q, chain.find_masses(job.nominal))
         q = sample_workspace(job.robot) if job.q is None else job.q
         chain.check_force_limits(q, given.source)
@@ -79,7 +80,7 @@ def write(job: ExportJob) -> ExportedFile:
     return ExportedFile(content, (*notices, *arm.list_limitations()), beside, offsets)
 
 
-def carries(cell: Cell) -> tuple[Term, ...]:
+def list_effects_held_by_mjcf(cell: Cell) -> tuple[Term, ...]:
     """The effects of a cell that elements hold, or a command map; those of 0 need nothing."""
     data = build_measurements_at_rest(
         np.zeros((1, cell.robot.joints)), cell.target_names, cell.robot
@@ -91,9 +92,14 @@ def carries(cell: Cell) -> tuple[Term, ...]:
     )
 
 
-def format_document(
-    document: XmlDocument, source: Path, path: Path | None
-) -> tuple[bytes, dict[str, bytes]]:
+class DocumentFiles(NamedTuple):
+    """The bytes of a document, and of the files beside it by their ending."""
+
+    content: bytes
+    companion_files: dict[str, bytes]
+
+
+def format_document(document: XmlDocument, source: Path, path: Path | None) -> DocumentFiles:
     """The text of a changed document at path: beside the given one its bytes but for the changes.
 
     Elsewhere it says where its assets are.  What it includes and what changed is in files of their
@@ -104,9 +110,9 @@ def format_document(
     if is_elsewhere and path is not None and any(e.get("file") for e in document.root.iter()):
         set_asset_directories(document.root, Path(os.path.relpath(here, path.resolve().parent)))
     if not document.pieces:
-        return MjcfTree(document.root).to_bytes(), {}
+        return DocumentFiles(MjcfTree(document.root).to_bytes(), {})
     how = XmlWriteOptions(is_elsewhere, path.stem if path else "")
-    return document.to_bytes(how), how.beside
+    return DocumentFiles(document.to_bytes(how), how.beside)
 
 
 def write_document(document: XmlDocument, source: Path, path: Path) -> None:
@@ -164,6 +170,6 @@ def build_new_tree(
     tree = MjcfTree(root)
     layout = ArmLayout(tree, names, tuple(bodies), tuple(joints),
                     np.broadcast_to(np.eye(4), (n, 4, 4)), np.zeros((n, 3)), axes,
-                    ModelServos.none(n), np.zeros(n), NEW_TIMESTEP)  # fmt: skip
+                    ModelServos.zeros(n), np.zeros(n), NEW_TIMESTEP)  # fmt: skip
     write_arm_elements(layout, arm, target_names, with_springs=with_springs)
     return tree

@@ -56,7 +56,7 @@ class MjcfTree:
         ET.indent(self.root)
         return bytes(ET.tostring(self.root, encoding="utf-8", xml_declaration=True)) + b"\n"
 
-    def section(self, tag: str) -> ET.Element:
+    def section_or_new(self, tag: str) -> ET.Element:
         """The first section of a tag, added where there is none."""
         found = self.root.find(tag)
         return ET.SubElement(self.root, tag) if found is None else found
@@ -84,9 +84,9 @@ class MjcfTree:
         every = [e for part in self.root.iter("actuator") for e in part]
         return [e for e in every if e.get("joint") == joint]
 
-    def find_servo(self, joint: str) -> ET.Element:
+    def servo_or_new(self, joint: str) -> ET.Element:
         """The position actuator of a joint; a new one of a free name where there is none."""
-        actuators, name = self.section("actuator"), joint
+        actuators, name = self.section_or_new("actuator"), joint
         for element in actuators:
             if element.get("joint") == joint and element.tag in ("position", "general"):
                 return element
@@ -94,7 +94,7 @@ class MjcfTree:
             name += "_servo"
         return ET.SubElement(actuators, "position", {"name": name, "joint": joint})
 
-    def remove(self, section: str, tag: str, name: str) -> None:
+    def remove_elements(self, section: str, tag: str, name: str) -> None:
         """Remove the elements of a name from all sections of a tag."""
         for holder in self.root.iter(section):
             for old in [e for e in holder.findall(tag) if e.get("name") == name]:

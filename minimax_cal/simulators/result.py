@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from minimax_cal.core.display_text import capitalise_sentence
-from minimax_cal.core.files import to_plain_json
+from minimax_cal.core.files import convert_to_plain_json
 from minimax_cal.core.record_fields import FieldFormat, derived_field
 from minimax_cal.core.results import Result
 from minimax_cal.core.tables import Table
@@ -278,7 +278,7 @@ class MotionGap(Result):
     def summarise_file(self) -> dict[str, Any]:
         """What another result says of the file that was written."""
         names = ("written", "elements", "left_out")
-        return {name: to_plain_json(getattr(self, name)) for name in names}
+        return {name: convert_to_plain_json(getattr(self, name)) for name in names}
 
     def table(self) -> Table:
         """RMS torque of each joint, rung by rung."""

@@ -51,7 +51,7 @@ def measure_answer_optimality(
     those that do it best.  start: (n,) where the search began, whose rounding x has.  Slopes by
     differences are taken as central ones.
     """
-    here = problem.linearise_with_best_accuracy(x)
+    here = problem.linearise_with_central_differences(x)
     size = min(
         abs(float(here.f.max())), value_variation_along_variables(problem, here.f, mu, x, start)
     )
@@ -62,7 +62,9 @@ def measure_answer_optimality(
     if check.kkt.residual <= tolerance:
         return check
     check = min(
-        check, measure_optimality_with_fitted_multipliers(problem, here, x, level), key=kkt_residual
+        check,
+        measure_optimality_with_fitted_multipliers(problem, here, x, level),
+        key=largest_kkt_residual,
     )
     if check.kkt.residual <= tolerance or check.kkt.violation > tolerance:
         return check
@@ -75,10 +77,10 @@ def measure_answer_optimality(
         measure_optimality(problem, here, x, check.mu, check.lam, level),
         measure_optimality_with_fitted_multipliers(problem, here, x, level),
     )
-    return min(trials, key=kkt_residual)
+    return min(trials, key=largest_kkt_residual)
 
 
-def kkt_residual(check: AnswerCheck) -> float:
+def largest_kkt_residual(check: AnswerCheck) -> float:
     """The largest of its three residuals."""
     return check.kkt.residual
 
@@ -92,7 +94,7 @@ def measure_optimality(
     level: float,
 ) -> AnswerCheck:
     """The residuals for given multipliers, where a change of the value by `level` matters."""
-    scaling = find_local_scaling(problem, linearisation, x, mu, level)
+    scaling = measure_scaling_at_point(problem, linearisation, x, mu, level)
     scaled, lower, upper = (
         scaling.apply(linearisation),
         problem.lower / scaling.c,
@@ -102,7 +104,9 @@ def measure_optimality(
     kkt = measure_kkt(scaled, mu, scaled_lam, lower, upper)
     # Multipliers of nearly equal rows may be huge: what cancels then shows nothing beyond the
     # rounding of the rows' entries.
-    uncertain = (problem.rows.derivative_rounding(x) * np.abs(scaled_lam)) @ np.abs(scaled.normal)
+    uncertain = (problem.rows.relative_derivative_rounding(x) * np.abs(scaled_lam)) @ np.abs(
+        scaled.normal
+    )
     # A gain is quadratic in what is left of smooth gradients: below the root of the values'
     # rounding it is less than that rounding.
     smooth = np.sqrt(EPS * float(mu @ np.abs(linearisation.f)) / level)
@@ -121,7 +125,7 @@ def measure_optimality_with_fitted_multipliers(
 ) -> AnswerCheck:
     """The residuals for the multipliers that balance the gradients best."""
     even = np.full(len(linearisation.f), 1.0 / len(linearisation.f))
-    scaling = find_local_scaling(problem, linearisation, x, even, level)
+    scaling = measure_scaling_at_point(problem, linearisation, x, even, level)
     scaled, lower, upper = (
         scaling.apply(linearisation),
         problem.lower / scaling.c,
@@ -131,7 +135,7 @@ def measure_optimality_with_fitted_multipliers(
     return measure_optimality(problem, linearisation, x, mu, lam * level / scaling.c, level)
 
 
-def find_local_scaling(
+def measure_scaling_at_point(
     problem: MaxOfFunctions, linearisation: Linearisation, x: Array, mu: Array, level: float
 ) -> Scaling:
     """Scaling of value, variables and rows at x, for a level of the value.
@@ -158,7 +162,9 @@ def value_variation_along_variables(
 
     It bounds what counts as the size of the value: a number added to all functions is no size.
     """
-    return largest_weighted_change(problem, f, mu, x, np.maximum(np.abs(x), np.abs(x - start)))
+    return largest_weighted_function_change(
+        problem, f, mu, x, np.maximum(np.abs(x), np.abs(x - start))
+    )
 
 
 def value_rounding_level(
@@ -170,15 +176,15 @@ def value_rounding_level(
     root of its rounding.  f: (m,) at x.
     """
     rounding = EPS * np.maximum(np.abs(x), np.abs(x - start))
-    bends = largest_weighted_change(
+    bends = largest_weighted_function_change(
         problem, f, mu, x, np.sqrt(EPS) * np.abs(x), is_second_order=True
     )
     return MIN_CHANGE_IN_ROUNDINGS * max(
-        largest_weighted_change(problem, f, mu, x, rounding), bends
+        largest_weighted_function_change(problem, f, mu, x, rounding), bends
     )
 
 
-def largest_weighted_change(
+def largest_weighted_function_change(
     problem: MaxOfFunctions,
     f: Array,
     mu: Array,
@@ -204,7 +210,7 @@ def largest_weighted_change(
     return largest
 
 
-def find_descent_from_stationary_point(problem: MaxOfFunctions, x: Array) -> Array | None:
+def find_better_point_near_stationary_point(problem: MaxOfFunctions, x: Array) -> Array | None:
     """A point near x that is better though every gradient vanishes at x, as on a hilltop.
 
     None where there is none, or where the multipliers balance gradients that do not vanish.
@@ -224,7 +230,7 @@ def find_descent_from_stationary_point(problem: MaxOfFunctions, x: Array) -> Arr
     return found
 
 
-def falls_without_end(
+def is_unbounded_below_along_line(
     problem: MaxOfFunctions, start: Array, far_point: Array, tolerance: float
 ) -> bool:
     """Whether the largest function falls on and on along the way from a start to an end.

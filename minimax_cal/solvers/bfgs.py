@@ -30,25 +30,25 @@ class Bfgs:
         return Bfgs(np.diag(default_diagonal), is_guess=True)
 
     def update(
-        self, s: Array, before: Linearisation, after: Linearisation, mu: Array, lam: Array
+        self, step: Array, before: Linearisation, after: Linearisation, mu: Array, lam: Array
     ) -> Bfgs:
         """With the change of the Lagrangian's gradient over the step s, same multipliers."""
         q = (after.jacobian - before.jacobian).T @ mu + (after.normal - before.normal).T @ lam
-        length = float(s @ s)
+        length = float(step @ step)
         if length == 0.0 or not np.all(np.isfinite(q)):
             return self
         matrix = self.matrix
-        if self.is_guess and q @ s > 0:  # size of the first guess [Nocedal and Wright, eq. 6.20]
+        if self.is_guess and q @ step > 0:  # size of the first guess [Nocedal and Wright, eq. 6.20]
             guess = np.diag(matrix)
-            matrix = float(q @ (q / guess)) / float(q @ s) * matrix
-        bs = matrix @ s
-        curve = float(s @ bs)
+            matrix = float(q @ (q / guess)) / float(q @ step) * matrix
+        bs = matrix @ step
+        curve = float(step @ bs)
         if curve <= 0.0:
             return self
-        if float(q @ s) < 0.2 * curve:  # Powell's damping
-            share = 0.8 * curve / (curve - float(q @ s))
+        if float(q @ step) < 0.2 * curve:  # Powell's damping
+            share = 0.8 * curve / (curve - float(q @ step))
             q = share * q + (1.0 - share) * bs
-        bs, q = bs / np.sqrt(curve), q / np.sqrt(float(q @ s))  # first, against overflow
+        bs, q = bs / np.sqrt(curve), q / np.sqrt(float(q @ step))  # first, against overflow
         new = matrix - np.outer(bs, bs) + np.outer(q, q)
         new = 0.5 * (new + new.T)
         if not is_positive_definite(new):  # by rounding, of entries of many sizes

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import Bounds, LinearConstraint, NonlinearConstraint
@@ -39,7 +39,7 @@ class ConstraintRows:
     upper: Array
 
     @staticmethod
-    def collect(
+    def from_scipy_constraints(
         x: Array, lengths: Array, bounds: Bounds | None, constraints: Sequence[Any]
     ) -> ConstraintRows:
         """Of variables at x (n,) with lengths (n,).
@@ -52,7 +52,7 @@ class ConstraintRows:
         bound_count = sum(len(matrix) for matrix, _, _ in blocks)
         parts, ends = [], []
         for given in constraints:
-            constraint = constraint_from_dictionary(given)
+            constraint = convert_dictionary_constraint(given)
             if isinstance(constraint, LinearConstraint):
                 blocks.append(constraint_to_linear_rows(constraint, n))
             elif isinstance(constraint, NonlinearConstraint):
@@ -85,45 +85,56 @@ class ConstraintRows:
         """c'(x): (l, n)."""
         return np.concatenate([self.linear, *(jacobian(x) for _, jacobian in self.parts)])
 
-    def best_jacobian(self, x: Array) -> Array:
+    def central_difference_jacobian(self, x: Array) -> Array:
         """c'(x): (l, n), by central differences in place of forward ones."""
         return np.concatenate(
-            [self.linear, *(jacobian.best_accuracy_jacobian(x) for _, jacobian in self.parts)]
+            [self.linear, *(jacobian.central_difference_jacobian(x) for _, jacobian in self.parts)]
         )
 
-    def derivative_rounding(self, x: Array) -> Array:
+    def relative_derivative_rounding(self, x: Array) -> Array:
         """(l,) relative error of each row's derivative."""
         linear = np.full(len(self.linear), EPS)
         curved = (np.full(len(fun(x)), jacobian.relative_rounding) for fun, jacobian in self.parts)
         return np.concatenate([linear, *curved])
 
-    def take_bounds(self) -> ConstraintRows:
+    def bound_rows(self) -> ConstraintRows:
         """The bounds alone."""
         k = self.bound_count
         return ConstraintRows(self.linear[:k], k, (), self.lower[:k], self.upper[:k])
 
 
-def constraint_from_dictionary(given: Any) -> Any:
+def convert_dictionary_constraint(constraint: Any) -> Any:
     """A constraint as it is, or of a dictionary of type, fun, jac, args.  Raises OptionError."""
-    if not isinstance(given, Mapping):
-        return given
-    kind, fun, jac = str(given.get("type")).lower(), given.get("fun"), given.get("jac")
+    if not isinstance(constraint, Mapping):
+        return constraint
+    kind, fun, jac = (
+        str(constraint.get("type")).lower(),
+        constraint.get("fun"),
+        constraint.get("jac"),
+    )
     if kind not in ("eq", "ineq") or not callable(fun):
         raise OptionError(
             "minimize_max: constraints are scipy.optimize's, or dictionaries of type 'eq' or "
-            f"'ineq', fun, jac and args, not dict of {', '.join(map(str, given)) or 'nothing'}"
+            f"'ineq', fun, jac and args, not dict of {', '.join(map(str, constraint)) or 'nothing'}"
         )
-    args, upper = given.get("args", ()), 0.0 if kind == "eq" else np.inf
+    args, upper = constraint.get("args", ()), 0.0 if kind == "eq" else np.inf
     args = args if isinstance(args, tuple) else (args,)
     if jac is True:
-        fun, jac = split_values_and_jacobian(fun)
+        fun, jac = split_function_with_jacobian(fun)
     slopes: Any = (lambda x: jac(x, *args)) if callable(jac) else jac or "2-point"
     return NonlinearConstraint(lambda x: fun(x, *args), 0.0, upper, jac=slopes)
 
 
-def split_values_and_jacobian(
+class SplitFunction(NamedTuple):
+    """Values and derivative of a function as two functions of the same arguments."""
+
+    values: Callable[..., Any]
+    jacobian: Callable[..., Any]
+
+
+def split_function_with_jacobian(
     fun: Callable[..., Any],
-) -> tuple[Callable[..., Any], Callable[..., Any]]:
+) -> SplitFunction:
     """Values and derivative of a function that returns both, which is asked once a place."""
     last: list[Any] = [None, None]
 
@@ -135,37 +146,45 @@ def split_values_and_jacobian(
             last[:] = place, copy.deepcopy(found)
         return last[1]
 
-    return (
+    return SplitFunction(
         lambda x, *args: evaluate_both(x, *args)[0],
         lambda x, *args: evaluate_both(x, *args)[1],
     )
 
 
-def parse_bounds(bounds: Any, n: int) -> Bounds | None:
+def convert_to_scipy_bounds(bounds: Any, variable_count: int) -> Bounds | None:
     """SciPy's Bounds of n variables, from pairs too, None where open.  Raises OptionError."""
     if bounds is None or isinstance(bounds, Bounds):
         return bounds
     try:
         ends = [(-np.inf if low is None else low, np.inf if high is None else high)
                 for low, high in bounds]  # fmt: skip
-        low, high = np.array(ends, dtype=float).reshape(n, 2).T
+        low, high = np.array(ends, dtype=float).reshape(variable_count, 2).T
     except (TypeError, ValueError):
-        raise OptionError(f"minimize_max: bounds: give {n} pairs (low, high), or Bounds") from None
+        raise OptionError(
+            f"minimize_max: bounds: give {variable_count} pairs (low, high), or Bounds"
+        ) from None
     return Bounds(low, high)
 
 
-def bounds_to_linear_rows(bounds: Bounds, variable_count: int) -> tuple[Array, Array, Array]:
+class LinearRows(NamedTuple):
+    """Rows lower <= matrix @ x <= upper."""
+
+    matrix: Array
+    lower: Array
+    upper: Array
+
+
+def bounds_to_linear_rows(bounds: Bounds, variable_count: int) -> LinearRows:
     """Matrix, lower and upper side of the bounds that are not open."""
     low, high = (
         np.broadcast_to(side, variable_count).astype(float) for side in (bounds.lb, bounds.ub)
     )
     closed = np.isfinite(low) | np.isfinite(high)
-    return np.eye(variable_count)[closed], low[closed], high[closed]
+    return LinearRows(np.eye(variable_count)[closed], low[closed], high[closed])
 
 
-def constraint_to_linear_rows(
-    constraint: LinearConstraint, variable_count: int
-) -> tuple[Array, Array, Array]:
+def constraint_to_linear_rows(constraint: LinearConstraint, variable_count: int) -> LinearRows:
     """Matrix, lower and upper side.  Raises OptionError where the matrix does not fit x."""
     matrix = to_dense_matrix(constraint.A)
     if matrix.shape[1] != variable_count:
@@ -173,10 +192,17 @@ def constraint_to_linear_rows(
             f"minimize_max: a LinearConstraint has {matrix.shape[1]}"
             f" columns, x has {variable_count}"
         )
-    return matrix, *broadcast_constraint_ends(constraint, len(matrix))
+    return LinearRows(matrix, *broadcast_constraint_ends(constraint, len(matrix)))
 
 
-def broadcast_constraint_ends(constraint: Any, row_count: int) -> tuple[Array, Array]:
+class LinearRowEnds(NamedTuple):
+    """(l,) lower and upper end of each row."""
+
+    lower: Array
+    upper: Array
+
+
+def broadcast_constraint_ends(constraint: Any, row_count: int) -> LinearRowEnds:
     """Lower and upper end of each row, from scalars or vectors.  Raises OptionError."""
     try:
         low, high = (
@@ -191,4 +217,4 @@ def broadcast_constraint_ends(constraint: Any, row_count: int) -> tuple[Array, A
         ) from None
     if np.isnan(low).any() or np.isnan(high).any():
         raise OptionError("minimize_max: an end of a constraint is NaN; open is -inf or inf")
-    return low, high
+    return LinearRowEnds(low, high)

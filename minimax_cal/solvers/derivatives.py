@@ -71,14 +71,14 @@ class CountedJacobian:
             return complex_step_jacobian(self.function, x, self.lengths)
         return self.difference_jacobian_at(x, self.scheme == "3-point")
 
-    def best_accuracy_jacobian(self, x: Array) -> Array:
+    def central_difference_jacobian(self, x: Array) -> Array:
         """(m, n) at x, by central differences in place of forward ones."""
         return self.difference_jacobian_at(x, True) if self.scheme == "2-point" else self(x)
 
-    def difference_jacobian_at(self, x: Array, central: bool) -> Array:
+    def difference_jacobian_at(self, x: Array, is_central: bool) -> Array:
         """(m, n) at x by central or forward differences."""
         steps = np.maximum(np.abs(x), self.lengths)
-        return difference_jacobian(self.function, x, steps, central)
+        return difference_jacobian(self.function, x, steps, is_central)
 
     @property
     def relative_rounding(self) -> float:
@@ -92,21 +92,21 @@ def to_dense_matrix(matrix: Any) -> Array:
     return np.atleast_2d(np.array(whole, dtype=float))
 
 
-def difference_jacobian(function: Function, x: Array, lengths: Array, central: bool) -> Array:
+def difference_jacobian(function: Function, x: Array, lengths: Array, is_central: bool) -> Array:
     """(m, n) by central or forward differences, with steps in shares of lengths (n,).
 
     One-sided where the functions have no finite value on the other side of x.
     """
-    steps = np.diag(EPS ** (1.0 / 3.0 if central else 0.5) * lengths)
+    steps = np.diag(EPS ** (1.0 / 3.0 if is_central else 0.5) * lengths)
     here = function(x)
     columns = []
     for step in steps:
         ahead = function(x + step)
-        behind = function(x - step) if central or not np.all(np.isfinite(ahead)) else here
+        behind = function(x - step) if is_central or not np.all(np.isfinite(ahead)) else here
         size = step.sum()
         with np.errstate(all="ignore"):
             forward, backward = (ahead - here) / size, (here - behind) / size
-            middle = (ahead - behind) / (2.0 * size) if central else forward
+            middle = (ahead - behind) / (2.0 * size) if is_central else forward
         column = np.where(np.isfinite(middle), middle, forward)
         columns.append(np.where(np.isfinite(column), column, backward))
     return np.stack(columns, axis=-1)

@@ -100,7 +100,7 @@ class SearchStep:
         working_set: the functions that the QP knew.  scaling: of the QP.
         """
         k, p = linearisation.jacobian.shape
-        usable, count = has_usable_answer(answer), len(working_set)
+        usable, count = is_answer_usable(answer), len(working_set)
         mu = np.zeros(k) if usable else np.full(k, 1.0 / k)
         if usable:
             mu[working_set] = np.maximum(answer.y[:count], 0.0)
@@ -156,9 +156,9 @@ def solve_subproblem(
         some = here if len(working_set) == len(here.f) else here.take_functions(working_set)
         qp = build_epigraph_qp(some, here.f.max(), hessian, lower, upper, decrease)
         answer = solve_qp(qp)
-        missed = find_functions_above(here, working_set, answer)
+        missed = find_functions_above_epigraph_bound(here, working_set, answer)
         working_set = np.concatenate([working_set, missed])
-    if has_usable_answer(answer) or not len(here.c):
+    if is_answer_usable(answer) or not len(here.c):
         return SearchStep.from_qp(answer, here, working_set, scaling)
 
     # Elastic mode [Nocedal and Wright, sec. 18.5]: violations are allowed at a penalty well above
@@ -169,14 +169,14 @@ def solve_subproblem(
     return replace(step, elastic_penalties=penalties)
 
 
-def has_usable_answer(answer: Solution) -> bool:
+def is_answer_usable(answer: Solution) -> bool:
     """Whether a QP has an answer, exact or not: what it is good for the search finds out."""
     return answer.usable or (
         answer.status is QpStatus.INACCURATE and bool(np.isfinite(answer.x).all())
     )
 
 
-def find_functions_above(
+def find_functions_above_epigraph_bound(
     linearisation: Linearisation, working_set: Array, answer: Solution
 ) -> Array:
     """Functions beyond the working set that an answer of the epigraph QP makes larger than v.
@@ -186,7 +186,7 @@ def find_functions_above(
     k, p = linearisation.jacobian.shape
     if len(working_set) == k:
         return working_set[:0]
-    if not has_usable_answer(answer):
+    if not is_answer_usable(answer):
         return np.setdiff1d(np.arange(k), working_set)
     over = (
         linearisation.f
@@ -240,7 +240,7 @@ def build_elastic_qp(problem: Problem, function_count: int, penalties: Array) ->
     return Problem(quadratic, linear, rows, low, high)
 
 
-def update_penalties(iterate: Iterate[X], step: SearchStep, tolerance: float) -> Array | None:
+def next_penalties_or_none(iterate: Iterate[X], step: SearchStep, tolerance: float) -> Array | None:
     """(l,) the next penalties; None where no penalty makes the constraints agree."""
     c, lower, upper = iterate.scaling.c, iterate.problem.lower, iterate.problem.upper
     if step.elastic_penalties is None:

@@ -61,12 +61,12 @@ def find_feasible_point(
 
     function = CountedFunction(violations)
     phase_one = MaxOfFunctions(
-        function, CountedJacobian(function, slopes, problem.lengths), rows.take_bounds(),
+        function, CountedJacobian(function, slopes, problem.lengths), rows.bound_rows(),
         problem.low, problem.high, 0, problem.lengths, problem.first_lengths,
     )  # fmt: skip
     bounded = np.clip(x, problem.low, problem.high)
     phase = replace(search, callback=None, history=[])
-    answer = phase.find_optimum(phase_one.rescale(bounded), bounded, with_feasibility=False)
+    answer = phase.find_optimum(phase_one.with_units_at(bounded), bounded, with_feasibility=False)
     search.iteration_count = phase.iteration_count
     c, normal = rows.values(answer.optimum.x), rows.jacobian(answer.optimum.x)
     left = problem.relative_violations(answer.optimum.x, c, normal).max(initial=0.0)

@@ -149,7 +149,7 @@ class Iterate(Generic[X]):
         return Scaling(level, self.reach, self.terms.constraint_units)
 
     @property
-    def scaled_lam(self) -> Array:
+    def scaled_constraint_multipliers(self) -> Array:
         """(l,) multipliers of the constraints in the scaled problem."""
         return np.asarray(self.lam * self.scaling.c / self.scaling.value)
 
@@ -212,7 +212,7 @@ class Iterate(Generic[X]):
         large = here.f >= np.partition(here.f, k - count)[k - count]
         return np.flatnonzero(large | (self.mu > 0.0) if self.qp_count else large)
 
-    def with_multipliers(
+    def update_after_qp(
         self, mu: Array, lam: Array, penalties: Array, is_exact: bool
     ) -> Iterate[X]:
         """The same point with the multipliers of a QP, one more iteration counted.
@@ -239,7 +239,7 @@ class Iterate(Generic[X]):
     def relative_decrease_bound(self) -> float:
         """By how much of itself the value may still fall, to first order, within the units."""
         here = self.scaling.apply(self.linearisation)
-        slopes = np.abs(self.mu @ here.jacobian + self.scaled_lam @ here.normal)
+        slopes = np.abs(self.mu @ here.jacobian + self.scaled_constraint_multipliers @ here.normal)
         return float(slopes.sum()) + self.kkt.complementarity
 
     def is_nearly_optimal(self, tolerance: float) -> bool:
@@ -261,7 +261,7 @@ class Iterate(Generic[X]):
             return Status.STALLED
         return None
 
-    def move_to(self, d: Array, x: X, there: Linearisation) -> Iterate[X]:
+    def after_step(self, d: Array, x: X, there: Linearisation) -> Iterate[X]:
         """At the end x of a step d (p,), less damped."""
         quasi_newton = self.quasi_newton and self.quasi_newton.update(
             d, self.linearisation, there, self.mu, self.lam

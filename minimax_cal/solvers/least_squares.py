@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Generic, Protocol, Self, TypeVar
+from typing import Generic, NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
 
 from minimax_cal.core.arrays import Array
+from minimax_cal.core.linear_algebra import column_norms_from_gram
 from minimax_cal.solvers.status import Status
 
 
@@ -30,6 +31,24 @@ class IterateBatch(Protocol):
 X = TypeVar("X", bound=IterateBatch)
 
 
+class CostGradientGram(NamedTuple):
+    """Sum of squares (B,), slope J'e (B, p) and Gram matrix J'J (B, p, p) of a batch."""
+
+    cost: Array
+    gradient: Array
+    gram: Array
+
+
+class ReducedProblem(NamedTuple, Generic[X]):
+    """Iterates at their best lengths r, `CostGradientGram` there, and the coupling (B, r, w)."""
+
+    x: X
+    cost: Array
+    gradient: Array
+    gram: Array
+    coupling: Array
+
+
 class SeparableProblem(Protocol[X]):
     """min over (r, omega) of |y - Phi(omega) r|^2, for a batch of B iterates."""
 
@@ -37,10 +56,10 @@ class SeparableProblem(Protocol[X]):
     def linear(self) -> Array:
         """(p,) True for the parameters r in which the residual is affine."""
 
-    def normal(self, x: X) -> tuple[Array, Array, Array]:
+    def normal(self, x: X) -> CostGradientGram:
         """Cost (B,), slope J'e (B, p) and Gram matrix J'J (B, p, p)."""
 
-    def reduced(self, x: X, *, full: bool) -> tuple[X, Array, Array, Array, Array]:
+    def reduced(self, x: X, *, full: bool) -> ReducedProblem[X]:
         """The iterates with their best lengths r, `normal` there, and the coupling.
 
         The coupling M = (d Phi/d omega)' e (B, r, omega) is needed only if full [paper S, eq. 24].
@@ -183,13 +202,21 @@ def solve(
     return LeastSquaresSolution(x, cost, iterations, tuple(status), np.stack(costs), method)
 
 
+class TrialStep(NamedTuple, Generic[X]):
+    """Iterates a step ahead, the mean motion (B,) of a point and the predicted decrease (B,)."""
+
+    iterates: LinearisedIterates[X]
+    point_motion: Array
+    predicted_decrease: Array
+
+
 def take_trial_step(
     problem: SeparableProblem[X],
     iterates: LinearisedIterates[X],
     damping: Array,
     residual_point_count: float,
     method: LeastSquaresMethod,
-) -> tuple[LinearisedIterates[X], Array, Array]:
+) -> TrialStep[X]:
     """Iterates a step ahead, the mean motion (B,) of a point, and the decrease (B,) predicted."""
     short, gain = solve_damped_step(iterates, damping)
     square = np.einsum("bi,bij,bj->b", short, iterates.matrix, short)
@@ -197,12 +224,21 @@ def take_trial_step(
     move = extend_step_to_all_parameters(
         problem.linear, short, iterates.gradient, iterates.gram, method
     )
-    return linearise_iterates(problem, problem.step(iterates.x, move), method), motion, gain
+    return TrialStep(
+        linearise_iterates(problem, problem.step(iterates.x, move), method), motion, gain
+    )
+
+
+class TrialComparison(NamedTuple):
+    """(B,) whether a trial costs less, and its decrease over the predicted one, 0 to 1."""
+
+    is_cheaper: Array
+    decrease_ratio: Array
 
 
 def compare_trial_costs(
     iterates: LinearisedIterates[X], trial: LinearisedIterates[X], predicted_decrease: Array
-) -> tuple[Array, Array]:
+) -> TrialComparison:
     """(B,) True where a trial costs less; the decrease over the one predicted, 0 to 1."""
     tiny = (
         predicted_decrease <= 1e-13 * iterates.cost
@@ -211,16 +247,23 @@ def compare_trial_costs(
         predicted_decrease > 0, predicted_decrease, np.inf
     )
     ratio = np.where(tiny | ~np.isfinite(ratio), 1.0, np.clip(ratio, 0.0, 1.0))
-    return (trial.cost < iterates.cost) | tiny, ratio
+    return TrialComparison((trial.cost < iterates.cost) | tiny, ratio)
+
+
+class Damping(NamedTuple):
+    """The damping of a step and its next growth, (B,) each."""
+
+    damping: Array
+    growth: Array
 
 
 def update_damping_by_nielsen(
     damping: Array, growth: Array, is_accepted: Array, decrease_ratio: Array
-) -> tuple[Array, Array]:
+) -> Damping:
     """The next damping and its next growth, (B,) each."""
     shrink = np.maximum(1.0 / 3.0, 1.0 - (2.0 * decrease_ratio - 1.0) ** 3)
     next_damping = np.where(is_accepted, damping * shrink, damping * growth)
-    return next_damping, np.where(is_accepted, 2.0, growth * 2.0)
+    return Damping(next_damping, np.where(is_accepted, 2.0, growth * 2.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,7 +313,7 @@ def linearise_iterates(
     if not method.separable:
         cost, gradient, gram = problem.normal(x)
         return LinearisedIterates(
-            x, cost, gradient, gram, gradient, gram, jacobian_column_norms(gram)
+            x, cost, gradient, gram, gradient, gram, column_norms_from_gram(gram)
         )
     x, cost, gradient, gram, coupled = problem.reduced(x, full=method.full)
     r, w = problem.linear, ~problem.linear
@@ -281,15 +324,10 @@ def linearise_iterates(
     angles = mixed.shape[-1]
     matrix = gram[:, w][:, :, w] - np.swapaxes(mixed, -1, -2) @ solved[..., :angles]
     matrix = matrix + np.swapaxes(coupled, -1, -2) @ solved[..., angles:]
-    size = np.maximum(jacobian_column_norms(matrix), 1e-5 * jacobian_column_norms(gram)[:, w])
+    size = np.maximum(column_norms_from_gram(matrix), 1e-5 * column_norms_from_gram(gram)[:, w])
     if method.damped:  # angles share a unit: the paper's mu I, in units of the largest column
         size = np.repeat(size.max(axis=1, keepdims=True), size.shape[1], axis=1)
     return LinearisedIterates(x, cost, gradient, gram, gradient[:, w], matrix, size)
-
-
-def jacobian_column_norms(gram: Array) -> Array:
-    """Norms of the Jacobian's columns: (B, p)."""
-    return np.asarray(np.sqrt(np.maximum(np.einsum("bii->bi", gram), 1e-300)))
 
 
 def extend_step_to_all_parameters(
@@ -306,7 +344,14 @@ def extend_step_to_all_parameters(
     return out
 
 
-def solve_damped_step(iterates: LinearisedIterates[X], damping: Array) -> tuple[Array, Array]:
+class DampedStep(NamedTuple):
+    """The step (B, p) and the predicted decrease (B,) of the cost."""
+
+    step: Array
+    predicted_decrease: Array
+
+
+def solve_damped_step(iterates: LinearisedIterates[X], damping: Array) -> DampedStep:
     """(H + mu D) step = slope with D = scale^2, and the predicted decrease of the cost."""
     scaled = iterates.matrix / iterates.scale[:, :, None] / iterates.scale[:, None, :]
     right = iterates.target / iterates.scale
@@ -316,7 +361,7 @@ def solve_damped_step(iterates: LinearisedIterates[X], damping: Array) -> tuple[
     )
     step = step[..., 0]
     model = 2.0 * right * step - step * (scaled @ step[..., None])[..., 0]
-    return step / iterates.scale, model.sum(-1)
+    return DampedStep(step / iterates.scale, model.sum(-1))
 
 
 def solve_normal_equations(matrix: Array, right: Array, *, rescale: bool = True) -> Array:

@@ -7,6 +7,7 @@ With a second-order correction where the curvature of the active pieces spoils t
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Generic, NamedTuple
 
 import numpy as np
 
@@ -22,9 +23,18 @@ MAX_STEP_LENGTHENING = 1e15  # times a step
 CorrectStep = Callable[[Array, Array], SearchStep]
 
 
+class LineSearchResult(NamedTuple, Generic[X]):
+    """Length that is taken (0 if none), its d (p,), the point at its end and the problem there."""
+
+    length: float
+    step: Array
+    end: X
+    linearisation: Linearisation
+
+
 def search_along_step(
     iterate: Iterate[X], step: SearchStep, correct_step: CorrectStep
-) -> tuple[float, Array, X, Linearisation]:
+) -> LineSearchResult[X]:
     """Length of the step that is taken (0 if none), its d (p,), its end and the problem there.
 
     The full step is nearly always taken, so its derivatives are computed at once.
@@ -52,11 +62,11 @@ def search_along_step(
         ahead = merit(there.f + there.jacobian @ step.d, there.c + there.normal @ step.d)
         length = 1.0
         if iterate.quasi_newton and value - ahead > MIN_FALLING_SLOPE * decrease > rounding:
-            length = lengthen_step(iterate, step.d, merit, start, value)
+            length = step_lengthening_factor(iterate, step.d, merit, start, value)
         if length == 1.0:
-            return 1.0, step.d, trial, there
+            return LineSearchResult(1.0, step.d, trial, there)
         trial = problem.step(x, length * step.d)
-        return length, length * step.d, trial, problem.linearise(trial)
+        return LineSearchResult(length, length * step.d, trial, problem.linearise(trial))
 
     # Second-order correction: what the linear model missed at the step goes into the constants.
     if np.isfinite(value):
@@ -68,7 +78,7 @@ def search_along_step(
             trial = problem.step(x, corrected.d)
             there = problem.linearise(trial)
             if merit(there.f, there.c) <= start - MIN_ARMIJO_DECREASE * decrease + rounding:
-                return 1.0, corrected.d, trial, there
+                return LineSearchResult(1.0, corrected.d, trial, there)
 
     # Backtracking, to the minimum of the parabola through slope and value where there is one.
     length = 1.0
@@ -80,11 +90,11 @@ def search_along_step(
         trial = problem.step(x, move)
         value = merit(*problem.evaluate(trial))
         if value <= start - MIN_ARMIJO_DECREASE * length * decrease + rounding:
-            return length, move, trial, problem.linearise(trial)
-    return 0.0, np.zeros_like(step.d), x, here
+            return LineSearchResult(length, move, trial, problem.linearise(trial))
+    return LineSearchResult(0.0, np.zeros_like(step.d), x, here)
 
 
-def lengthen_step(
+def step_lengthening_factor(
     iterate: Iterate[X],
     d: Array,
     merit: Callable[[Array, Array], float],

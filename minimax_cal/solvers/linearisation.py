@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeVar
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
@@ -46,6 +46,13 @@ class Linearisation:
         return np.asarray(1.0 / np.where(steepest > 0.0, steepest, 1.0))
 
 
+class FunctionsAndConstraints(NamedTuple):
+    """Values of the functions (k,) and of the constraints (l,)."""
+
+    f: Array
+    c: Array
+
+
 class MinimaxProblem(Protocol[X]):
     """A smooth max-of-functions problem with two-sided constraints."""
 
@@ -57,7 +64,7 @@ class MinimaxProblem(Protocol[X]):
     def upper(self) -> Array:
         """(l,) inf where open."""
 
-    def evaluate(self, x: X) -> tuple[Array, Array]:
+    def evaluate(self, x: X) -> FunctionsAndConstraints:
         """f (k,) and c (l,)."""
 
     def linearise(self, x: X) -> Linearisation:
@@ -152,9 +159,16 @@ def measure_kkt(
     return Kkt(float(np.abs(stationarity).max(initial=0.0)), complementarity, violation)
 
 
+class Multipliers(NamedTuple):
+    """Multipliers of the functions (k,), which sum to one, and of the constraints (l,)."""
+
+    mu: Array
+    lam: Array
+
+
 def fit_multipliers_by_least_squares(
     linearisation: Linearisation, lower: Array, upper: Array
-) -> tuple[Array, Array]:
+) -> Multipliers:
     """mu and lam that make stationarity and complementarity at a point least, mu of sum one.
 
     Non-negative least squares, so that nothing of a QP solver is in them.
@@ -169,7 +183,7 @@ def fit_multipliers_by_least_squares(
         [linearisation.jacobian, linearisation.normal[above], -linearisation.normal[below]]
     ).T
     if not np.all(np.isfinite(columns)):
-        return np.full(k, 1.0 / k), np.zeros(len(linearisation.c))
+        return Multipliers(np.full(k, 1.0 / k), np.zeros(len(linearisation.c)))
     rooms = (
         linearisation.f.max() - linearisation.f,
         (upper - linearisation.c)[above],
@@ -185,7 +199,7 @@ def fit_multipliers_by_least_squares(
     lam = np.zeros(len(linearisation.c))
     lam[above] += found[k : k + len(above)]
     lam[below] -= found[k + len(above) :]
-    return found[:k], lam
+    return Multipliers(found[:k], lam)
 
 
 def constraint_excess(c: Array, lower: Array, upper: Array) -> Array:

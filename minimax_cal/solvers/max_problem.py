@@ -15,7 +15,11 @@ from minimax_cal.solvers.derivatives import (
     CountedJacobian,
     measure_variable_lengths,
 )
-from minimax_cal.solvers.linearisation import Linearisation, constraint_excess
+from minimax_cal.solvers.linearisation import (
+    FunctionsAndConstraints,
+    Linearisation,
+    constraint_excess,
+)
 
 ROW_SIZE_SHARE_OF_REACH = (
     1e-6  # of what a row's variables could reach: so much of its size is always there
@@ -75,12 +79,12 @@ class MaxOfFunctions:
                 f"minimize_max: jac(x0) has shape {slopes.shape}; {len(values)} functions of "
                 f"{len(x)} variables need {(len(values), len(x))}"
             )
-        rows = ConstraintRows.collect(x, lengths, bounds, constraints)
+        rows = ConstraintRows.from_scipy_constraints(x, lengths, bounds, constraints)
         return MaxOfFunctions(
             function, jacobian, rows, low, high, int(np.frexp(level)[1]), lengths, lengths
         )
 
-    def rescale(self, x: Array) -> MaxOfFunctions:
+    def with_units_at(self, x: Array) -> MaxOfFunctions:
         """The same problem with the units of values and variables as they are at x."""
         values = self.function(x)
         level = float(abs(values.max())) or float(np.abs(values).max())
@@ -109,9 +113,9 @@ class MaxOfFunctions:
         with np.errstate(over="ignore"):
             return np.asarray(np.ldexp(values, -self.exponent))
 
-    def evaluate(self, x: Array) -> tuple[Array, Array]:
+    def evaluate(self, x: Array) -> FunctionsAndConstraints:
         """f and c."""
-        return self.values(x), self.rows.values(x)
+        return FunctionsAndConstraints(self.values(x), self.rows.values(x))
 
     def linearise(self, x: Array) -> Linearisation:
         """f, c and their derivatives; the curvature is left to BFGS."""
@@ -119,11 +123,13 @@ class MaxOfFunctions:
         slopes = np.ldexp(self.jacobian(x), -self.exponent)
         return Linearisation(f, slopes, c, self.rows.jacobian(x), empty_curvature)
 
-    def linearise_with_best_accuracy(self, x: Array) -> Linearisation:
+    def linearise_with_central_differences(self, x: Array) -> Linearisation:
         """The same with central differences in place of forward ones."""
-        slopes = np.ldexp(self.jacobian.best_accuracy_jacobian(x), -self.exponent)
+        slopes = np.ldexp(self.jacobian.central_difference_jacobian(x), -self.exponent)
         f, c = self.evaluate(x)
-        return Linearisation(f, slopes, c, self.rows.best_jacobian(x), empty_curvature)
+        return Linearisation(
+            f, slopes, c, self.rows.central_difference_jacobian(x), empty_curvature
+        )
 
     def step(self, x: Array, d: Array) -> Array:
         """The point moved."""

@@ -21,8 +21,8 @@ from minimax_cal.core.arrays import Array
 from minimax_cal.solvers.epigraph_qp import (
     CountingQpSolver,
     VerifiedQpSolver,
+    next_penalties_or_none,
     solve_subproblem,
-    update_penalties,
 )
 from minimax_cal.solvers.iterate import NO_MULTIPLIERS, Iterate, StartScales, X
 from minimax_cal.solvers.line_search import search_along_step
@@ -133,8 +133,8 @@ def solve(
             step = replace(step, mu=balanced.mu, lam=balanced.lam)
 
         # Penalties of violations, at least as large as the multipliers.
-        penalties = update_penalties(iterate, step, tolerance)
-        iterate = iterate.with_multipliers(
+        penalties = next_penalties_or_none(iterate, step, tolerance)
+        iterate = iterate.update_after_qp(
             step.mu, step.lam, iterate.penalties if penalties is None else penalties, step.exact
         )
         if penalties is None:
@@ -151,7 +151,7 @@ def solve(
         report(trace[-1])
         status = iterate.status_before_step(tolerance, step.exact)
         if status is None:
-            iterate = iterate.move_to(d, end, there) if length else iterate.with_more_damping()
+            iterate = iterate.after_step(d, end, there) if length else iterate.with_more_damping()
             status = iterate.status_after_step(tolerance, step.exact)
 
         # Where nothing moves any more, the multipliers of the QP may be to blame.

@@ -15,11 +15,14 @@ from minimax_cal.core.errors import OptionError
 from minimax_cal.solvers import minimax
 from minimax_cal.solvers.answer_check import (
     AnswerCheck,
-    falls_without_end,
-    find_descent_from_stationary_point,
+    find_better_point_near_stationary_point,
+    is_unbounded_below_along_line,
     measure_answer_optimality,
 )
-from minimax_cal.solvers.constraint_rows import parse_bounds, split_values_and_jacobian
+from minimax_cal.solvers.constraint_rows import (
+    convert_to_scipy_bounds,
+    split_function_with_jacobian,
+)
 from minimax_cal.solvers.derivatives import CountedFunction, find_function_with_wrong_gradient
 from minimax_cal.solvers.epigraph_qp import VerifiedQpSolver
 from minimax_cal.solvers.feasibility import find_feasible_point
@@ -27,7 +30,7 @@ from minimax_cal.solvers.iterate import NO_MULTIPLIERS, StartScales
 from minimax_cal.solvers.linearisation import constraint_excess
 from minimax_cal.solvers.max_problem import EPS, MaxOfFunctions
 from minimax_cal.solvers.minimax import Optimum, Sqp, Step
-from minimax_cal.solvers.qp_function import QpFunction, adapt_qp_function
+from minimax_cal.solvers.qp_function import QpFunction, build_verified_qp_solver
 from minimax_cal.solvers.status import Status
 from qp_backends import solve as solve_qp
 from qp_backends.registry import BackendName
@@ -137,9 +140,9 @@ def minimize_max(
         raise OptionError(f"minimize_max: tol {tol:g}, maxiter {maxiter}: give tol between 0 and 1 "
                           "and maxiter of 1 or more")  # fmt: skip
     if jac is True:
-        fun, jac = split_values_and_jacobian(fun)
+        fun, jac = split_function_with_jacobian(fun)
     scheme: Any = (lambda z: jac(z, *args)) if callable(jac) else jac or "2-point"
-    box = parse_bounds(bounds, len(x))
+    box = convert_to_scipy_bounds(bounds, len(x))
     alone = isinstance(constraints, Constraint | Mapping)
     rows: Any = [constraints] if alone else constraints
     if box is not None:
@@ -149,11 +152,11 @@ def minimize_max(
     solver: VerifiedQpSolver = (
         partial(solve_qp, name=qp, tolerance=QP_TOLERANCE)
         if isinstance(qp, str)
-        else adapt_qp_function(qp, QP_TOLERANCE)
+        else build_verified_qp_solver(qp, QP_TOLERANCE)
     )
     is_exact = callable(jac) or jac == "cs"
-    if is_exact and (wrong := find_wrong_gradient(problem, x)) is not None:
-        return report_wrong_gradient(problem, x, wrong)
+    if is_exact and (wrong := find_index_of_wrong_gradient(problem, x)) is not None:
+        return build_wrong_gradient_result(problem, x, wrong)
 
     search = OptimumSearch(solver, tol, maxiter, callback)
     answer = search.find_optimum(problem, x)
@@ -162,9 +165,9 @@ def minimize_max(
     if (
         status != UNBOUNDED_STATUS
         and is_exact
-        and (wrong := find_wrong_gradient(problem, optimum.x)) is not None
+        and (wrong := find_index_of_wrong_gradient(problem, optimum.x)) is not None
     ):
-        return report_wrong_gradient(problem, optimum.x, wrong)
+        return build_wrong_gradient_result(problem, optimum.x, wrong)
     values = problem.function(optimum.x)
     violation = constraint_excess(optimum.c, problem.lower, problem.upper).max(initial=0.0)
     message = STATUS_MESSAGES[status]
@@ -223,7 +226,7 @@ class OptimumSearch:
         while True:
             optimum = self.run_sqp(problem, x, mu, largest_level)
             x, last_exponent = optimum.x, problem.exponent
-            problem = problem.rescale(x)
+            problem = problem.with_units_at(x)
             lam = np.ldexp(optimum.lam, last_exponent - problem.exponent)
             optimum = replace(optimum, f=problem.values(x), lam=lam)
             check = measure_answer_optimality(
@@ -235,14 +238,14 @@ class OptimumSearch:
             answer = SearchAnswer(problem, optimum, check, Status.CONVERGED)
 
             if check.kkt.residual <= self.tolerance:
-                lower = find_descent_from_stationary_point(problem, x)
+                lower = find_better_point_near_stationary_point(problem, x)
                 if lower is None or escape_count == MAX_STATIONARY_POINT_ESCAPES:
                     return answer
                 x, mu, escape_count = lower, NO_MULTIPLIERS, escape_count + 1
                 continue
             has_ended = self.iteration_count >= self.max_iterations
             if (has_ended or optimum.status is Status.FAILED) and (
-                self.falls_without_end(described, start, x)
+                self.is_unbounded_below_between(described, start, x)
             ):
                 return replace(answer, status=UNBOUNDED_STATUS)
             if has_ended:
@@ -256,7 +259,7 @@ class OptimumSearch:
                     return replace(answer, status=Status.INFEASIBLE)
                 with_feasibility = False
                 if found.is_feasible:
-                    x, mu, problem = found.x, NO_MULTIPLIERS, problem.rescale(found.x)
+                    x, mu, problem = found.x, NO_MULTIPLIERS, problem.with_units_at(found.x)
                     last_value = last_violation = largest_level = np.inf
                     continue
 
@@ -274,12 +277,12 @@ class OptimumSearch:
             if problem.jacobian.scheme == "2-point":  # too coarse
                 problem.jacobian.scheme = "3-point"
                 continue
-            if self.falls_without_end(described, start, x):
+            if self.is_unbounded_below_between(described, start, x):
                 return replace(answer, status=UNBOUNDED_STATUS)
             ended = optimum.status
             return replace(answer, status=Status.STALLED if ended is Status.CONVERGED else ended)
 
-    def falls_without_end(self, problem: MaxOfFunctions, start: Array, end: Array) -> bool:
+    def is_unbounded_below_between(self, problem: MaxOfFunctions, start: Array, end: Array) -> bool:
         """Whether the functions fall on and on from a feasible point near a start to an end."""
         anchor = start
         if largest_violation(problem, start) > self.tolerance:
@@ -287,7 +290,7 @@ class OptimumSearch:
             if not found.is_feasible:
                 return False
             anchor = found.x
-        return falls_without_end(problem, anchor, end, self.tolerance)
+        return is_unbounded_below_along_line(problem, anchor, end, self.tolerance)
 
     def run_sqp(
         self, problem: MaxOfFunctions, x: Array, mu: Array, largest_level: float
@@ -324,7 +327,7 @@ def largest_violation(problem: MaxOfFunctions, x: Array) -> float:
     return float(np.nan_to_num(violations, nan=np.inf).max(initial=0.0))
 
 
-def find_wrong_gradient(problem: MaxOfFunctions, x: Array) -> int | None:
+def find_index_of_wrong_gradient(problem: MaxOfFunctions, x: Array) -> int | None:
     """Index of a function whose given gradient is not its derivative near x."""
     return find_function_with_wrong_gradient(
         problem.values, lambda z: problem.linearise(z).jacobian, x, problem.low, problem.high,
@@ -332,7 +335,7 @@ def find_wrong_gradient(problem: MaxOfFunctions, x: Array) -> int | None:
     )  # fmt: skip
 
 
-def report_wrong_gradient(problem: MaxOfFunctions, x: Array, index: int) -> OptimizeResult:
+def build_wrong_gradient_result(problem: MaxOfFunctions, x: Array, index: int) -> OptimizeResult:
     """The result where a gradient is wrong: no answer, and where it was found out."""
     values = problem.function(x)
     status = "wrong_gradient"

@@ -20,7 +20,9 @@ QpFunction = Callable[[Problem], Any]  # to x (n,), (x, y) or a Solution
 MAX_USABLE_QP_VIOLATION = 1e-2  # relative violation above which an answer is none
 
 
-def adapt_qp_function(qp: QpFunction, tolerance: float, name: str = "qp") -> VerifiedQpSolver:
+def build_verified_qp_solver(
+    qp: QpFunction, tolerance: float, name: str = "qp"
+) -> VerifiedQpSolver:
     """A solver from a function of the problem alone; its answers are judged by `accuracy`.
 
     tolerance: up to which relative residual an answer counts as solved.  name: of the backend,

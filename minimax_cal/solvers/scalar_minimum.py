@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,10 +12,17 @@ GOLDEN_SECTION_FRACTION = 0.5 * (3.0 - math.sqrt(5.0))
 ROOT_OF_EPS = math.sqrt(np.finfo(float).eps)
 
 
+class ScalarMinimum(NamedTuple):
+    """Where a function is least, and its value there."""
+
+    argument: float
+    value: float
+
+
 def minimise_scalar_between(
     function: Callable[[float], float], low: float, high: float, tolerance: float = 1e-5
-) -> tuple[float, float]:
-    """Where a function with one minimum is least, and its value there.
+) -> ScalarMinimum:
+    """Find the minimum of a function of one variable that has one between two ends.
 
     Golden sections, and parabolas where they are short [Brent 1973, ch. 5; Forsythe, Malcolm and
     Moler 1977, sec. 8.2].  tolerance: of the place.
@@ -25,7 +33,7 @@ def minimise_scalar_between(
     while True:
         middle, near = 0.5 * (low + high), ROOT_OF_EPS * abs(best) + tolerance / 3.0
         if abs(best - middle) <= 2.0 * near - 0.5 * (high - low):
-            return best, at_best
+            return ScalarMinimum(best, at_best)
         golden = True
         if abs(before) > near:  # a parabola through the three best
             r = (best - second) * (at_best - at_third)

@@ -9,13 +9,13 @@ errors but that poses are independent.  The poses left out of a replicate judge 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from minimax_cal.core.arrays import Array
 from minimax_cal.core.errors import DataError, OptionError
-from minimax_cal.core.files import to_plain_json
+from minimax_cal.core.files import convert_to_plain_json
 from minimax_cal.core.option_fields import check_seed
 from minimax_cal.core.progress_stages import build_counted_stage
 from minimax_cal.core.record_fields import scale_numbers
@@ -127,7 +127,7 @@ class Bootstrap:
             "parameters": columns_to_records(columns),
             "out_of_bag_rms_mm": None if np.isnan(rms.low) else [*scale_numbers(rms, 1e3)],
         }
-        return dict(to_plain_json(whole))
+        return dict(convert_to_plain_json(whole))
 
 
 def percentile_interval(values: Array, level: float) -> Array:
@@ -184,8 +184,8 @@ def bootstrap(
     lost = replicates - int(np.count_nonzero(good))
     if lost > MAX_LOST_FRACTION * replicates:
         raise DataError(
-            f"{fit.data.source}: {lost} of {replicates} draws of {draws.times.shape[1]} poses do "
-            f"not determine the {change.shape[1]} parameters; measure more poses"
+            f"{fit.data.source}: {lost} of {replicates} draws of {draws.draw_counts.shape[1]} "
+            f"poses do not determine the {change.shape[1]} parameters; measure more poses"
         )
     place = np.flatnonzero(fit.identification.active)
     names = fit.estimator.model.names.all_names
@@ -204,14 +204,14 @@ def bootstrap(
 
 @dataclass(frozen=True, eq=False)
 class PoseDraws:
-    """times: (B, M) how often each pose is drawn.  member: (m,) the pose of each row."""
+    """draw_counts: (B, M) how often each pose is drawn.  pose_of_row: (m,) the pose of each row."""
 
-    times: Array
-    member: Array
+    draw_counts: Array
+    pose_of_row: Array
 
-    def row_counts(self, number: int) -> Array:
+    def draw_counts_of_rows(self, replicate: int) -> Array:
         """(m,) how often each row is drawn in one replicate."""
-        return np.asarray(self.times[number][self.member])
+        return np.asarray(self.draw_counts[replicate][self.pose_of_row])
 
 
 def draw_poses(pose_groups: Array, replicates: int, rng: np.random.Generator) -> PoseDraws:
@@ -222,38 +222,47 @@ def draw_poses(pose_groups: Array, replicates: int, rng: np.random.Generator) ->
     return PoseDraws(rng.multinomial(count, np.full(count, 1.0 / count), size=replicates), member)
 
 
+class BootstrapReplicates(NamedTuple):
+    """Changes (B, p) of the free parameters, and (B,) True where a replicate is one."""
+
+    change: Array
+    is_usable: Array
+
+
 def refit_by_gauss_newton_steps(
     fit: Fit, draws: PoseDraws, progress: Progress
-) -> tuple[Array, Array]:
+) -> BootstrapReplicates:
     """Replicates of a sum of squares: two Gauss-Newton steps from the fit.
 
     The first takes all at once, since each row's part of the normal equations is the same for all.
     Returns the changes (B, p) of the free parameters, and (B,) True where the draws determine them.
     """
     estimator, state = fit.estimator, fit.cell.parameter_values
-    model = estimator.model.weight_targets(estimator.share)
+    model = estimator.model.with_target_weights(estimator.share)
     model = with_pose_errors(model, estimator.mix) if len(estimator.mix) else model
     part, gradient = normal_equations_by_pose(model, state, draws)
     prior = model.prior.weight[model.active]
     off = (model.prior.mean - model.parameter_vector(state))[model.active]
     good = is_draw_determined(draws, part, prior)
-    gram = np.tensordot(draws.times[good], part, 1) + np.diag(prior)
+    gram = np.tensordot(draws.draw_counts[good], part, 1) + np.diag(prior)
     change = np.zeros((len(good), len(prior)))
     change[good] = solve_normal_equations(
-        gram, (draws.times[good] @ gradient + prior * off)[..., None]
+        gram, (draws.draw_counts[good] @ gradient + prior * off)[..., None]
     )[..., 0]
     for done, number in enumerate(np.flatnonzero(good).tolist()):
         if done % REPLICATES_PER_PROGRESS == 0:
             progress(build_counted_stage("replicate", number + 1, len(good)))
-        problem = PointLeastSquares(replace(model, weight=model.weight * draws.row_counts(number)))
+        problem = PointLeastSquares(
+            replace(model, weight=model.weight * draws.draw_counts_of_rows(number))
+        )
         x = problem.step(state, change[number])
         _, gradient, gram = problem.normal(x)
         x = problem.step(x, solve_normal_equations(gram, gradient[:, None])[:, 0])
         change[number] = parameter_step(state, x)[model.active]
-    return change, good
+    return BootstrapReplicates(change, good)
 
 
-def refit_minimax_replicates(fit: Fit, draws: PoseDraws, progress: Progress) -> tuple[Array, Array]:
+def refit_minimax_replicates(fit: Fit, draws: PoseDraws, progress: Progress) -> BootstrapReplicates:
     """Replicates of a minimax, each solved from the fit.  Returns as
     `refit_by_gauss_newton_steps`.
     """
@@ -272,30 +281,37 @@ def refit_minimax_replicates(fit: Fit, draws: PoseDraws, progress: Progress) -> 
     for done, number in enumerate(np.flatnonzero(good).tolist()):
         if done % REPLICATES_PER_PROGRESS == 0:
             progress(build_counted_stage("replicate", number + 1, len(good)))
-        rows = np.repeat(np.arange(len(draws.member)), draws.row_counts(number))
+        rows = np.repeat(np.arange(len(draws.pose_of_row)), draws.draw_counts_of_rows(number))
         model = estimator.at_poses(rows).model
         distances = measured_distances(train.take(rows), options.distance_tolerance)
         problem = build_minimax_problem(model, state, distances, options.distance, "target")
         best = minimax.solve(problem, state, qp, settings, mu=mu)
         good[number] = best.status is Status.CONVERGED
         change[number] = parameter_step(state, best.x)[active]
-    return change, good
+    return BootstrapReplicates(change, good)
+
+
+class PoseNormalEquations(NamedTuple):
+    """What each pose adds to the Gram matrix (M, p, p) and the gradient (M, p)."""
+
+    gram: Array
+    gradient: Array
 
 
 def normal_equations_by_pose(
     model: PointModel, state: ParameterValues, draws: PoseDraws
-) -> tuple[Array, Array]:
+) -> PoseNormalEquations:
     """What each pose adds to Gram matrix (M, p, p) and gradient (M, p) of the free parameters."""
-    count, p = draws.times.shape[1], int(model.active.sum())
+    count, p = draws.draw_counts.shape[1], int(model.active.sum())
     gram, gradient = np.zeros((count, p, p)), np.zeros((count, p))
     for block in model.split_into_blocks(state):
         error, turned = model.block_errors_and_jacobian(state, block, model.active)
         jacobian = np.moveaxis(turned, (3, 1), (0, 1)).reshape(error.shape[-1], p, -1)
-        own = draws.member[block.rows]
+        own = draws.pose_of_row[block.rows]
         np.add.at(gram, own, jacobian @ np.swapaxes(jacobian, 1, 2))
         flat = np.moveaxis(error, 2, 0).reshape(len(jacobian), -1, 1)
         np.add.at(gradient, own, (jacobian @ flat)[..., 0])
-    return gram, gradient
+    return PoseNormalEquations(gram, gradient)
 
 
 def is_draw_determined(draws: PoseDraws, gram: Array, prior: Array) -> Array:
@@ -303,9 +319,11 @@ def is_draw_determined(draws: PoseDraws, gram: Array, prior: Array) -> Array:
     root = np.linalg.inv(np.linalg.cholesky(gram.sum(axis=0) + np.diag(prior)))
     alike = root @ gram @ root.T
     known = root @ np.diag(prior) @ root.T
-    out = np.zeros(len(draws.times), dtype=bool)
+    out = np.zeros(len(draws.draw_counts), dtype=bool)
     for first in range(0, len(out), REPLICATES_PER_BATCH):
-        part = np.tensordot(draws.times[first : first + REPLICATES_PER_BATCH], alike, 1) + known
+        part = (
+            np.tensordot(draws.draw_counts[first : first + REPLICATES_PER_BATCH], alike, 1) + known
+        )
         out[first : first + REPLICATES_PER_BATCH] = (
             np.linalg.eigvalsh(part)[:, 0] > MIN_DRAWN_INFORMATION_FRACTION
         )
@@ -333,7 +351,7 @@ def out_of_bag_rms(fit: Fit, change: Array, draws: PoseDraws, is_determined: Arr
     jacobian = model.point_jacobian(state)[..., model.active]
     out = np.full(len(change), np.nan)
     for i, number in enumerate(np.flatnonzero(is_determined).tolist()):
-        left = draws.row_counts(number) == 0
+        left = draws.draw_counts_of_rows(number) == 0
         seen = model.measured_mask.T[left]
         if seen.any():
             square = ((error[left] - jacobian[left] @ change[i]) ** 2).sum(axis=-1)

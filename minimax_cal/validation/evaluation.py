@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -207,7 +207,9 @@ def evaluate_with_notices(
     )
 
 
-def evaluate_on_instrument(source: Given, one: Instrument, rung: int | None) -> Evaluation:
+def evaluate_on_instrument(
+    source: Given, judged_instrument: Instrument, rung: int | None
+) -> Evaluation:
     """How well an arm fits what an instrument measured, whose own unknowns are fitted to it."""
     opened = open_result(source, rung)
     robot, step = opened.cell.robot, opened.rungs[opened.number].name
@@ -216,18 +218,23 @@ def evaluate_on_instrument(source: Given, one: Instrument, rung: int | None) -> 
             f"{opened.source}: its effects are judged by points of a tracker alone; take a step "
             "without them (step 1)"
         )
-    one, options = replace(one, at=check_and_complete_joints(robot, one.at)), RelativeOptions()
-    stack = build_training_stack(robot, {"": one}, options)
+    judged_instrument, options = (
+        replace(judged_instrument, at=check_and_complete_joints(robot, judged_instrument.at)),
+        RelativeOptions(),
+    )
+    stack = build_training_stack(robot, {"": judged_instrument}, options)
     x, block = (
         build_start_state(robot, stack, select_parameters(stack, options)[0]),
         stack.blocks[0],
     )
     error = block.instrument.part_errors(
-        *block.flange_and_own_values(x), np.zeros(one.poses, dtype=bool)
+        *block.flange_and_own_values(x), np.zeros(judged_instrument.poses, dtype=bool)
     )
     found, data = (
-        MeasuredAccuracy.from_errors(error, [one.unit], int(one.numbers_per_pose.sum())),
-        one.at,
+        MeasuredAccuracy.from_errors(
+            error, [judged_instrument.unit], int(judged_instrument.numbers_per_pose.sum())
+        ),
+        judged_instrument.at,
     )
     seen = bool(data.digest) and data.digest in opened.digest.split()
     said = [f"{data.source}: what the instrument has of its own is fitted to these rows"]
@@ -249,23 +256,26 @@ def evaluate_on_instrument(source: Given, one: Instrument, rung: int | None) -> 
         set_aside=data.set_aside,
         with_them=None,
         shown=part_error_table(
-            f"{one.words.quantity} on {data.source}", found, block.instrument, error
+            f"{judged_instrument.words.quantity} on {data.source}", found, block.instrument, error
         ),
         notices=(*data.notices, *said),
     )
 
 
-def part_error_table(title: str, whole: MeasuredAccuracy, one: Instrument, error: Array) -> Table:
+def part_error_table(
+    title: str, whole: MeasuredAccuracy, judged_instrument: Instrument, error: Array
+) -> Table:
     """Errors of each part of an instrument, as of each wire, and of all, in its unit.
 
     error: (m, parts, 3), NaN where not measured [unit].
     """
-    if one.unit == METRE_UNIT:
-        return whole.table(title, one.part_names)
+    if judged_instrument.unit == METRE_UNIT:
+        return whole.table(title, judged_instrument.part_names)
     parts = [
-        MeasuredAccuracy.from_errors(part[:, None], [one.unit]) for part in np.swapaxes(error, 0, 1)
+        MeasuredAccuracy.from_errors(part[:, None], [judged_instrument.unit])
+        for part in np.swapaxes(error, 0, 1)
     ]
-    every = zip((*one.part_names, "all"), (*parts, whole), strict=True)
+    every = zip((*judged_instrument.part_names, "all"), (*parts, whole), strict=True)
     rows = ((n, sum(s.counts), *s.for_display[:3]) for n, s in every)
     unit = whole.for_display[-1]
     columns = f"part | numbers d | RMS {unit} .4g | max {unit} .4g | mean {unit} .4g"
@@ -315,40 +325,54 @@ def open_saved_result(
     return SavedResult(cells, measured, held, known.uncertainty, tuple(notices), known.spans)
 
 
-def find_unseen_poses(data: Measurements, known: OpenedResult) -> tuple[Array, tuple[str, ...]]:
-    """(m,) True where the fit has not seen the pose, by its own split or by the joints; notices."""
+class UnseenPoses(NamedTuple):
+    """(m,) True where a fit has not seen the pose, and notices on how that is known."""
+
+    mask: Array
+    notices: tuple[str, ...]
+
+
+def find_unseen_poses(data: Measurements, known: OpenedResult) -> UnseenPoses:
+    """Find the poses that a fit has not seen, by its own split or by the joints."""
     if not known.data.poses:
         said = "the fit does not tell its training poses: all count as training poses"
-        return np.zeros(data.poses, dtype=bool), (said,)
+        return UnseenPoses(np.zeros(data.poses, dtype=bool), (said,))
     if data.digest and data.digest == known.digest:
-        return np.isin(data.line, known.data.line[known.held]), ()
+        return UnseenPoses(np.isin(data.line, known.data.line[known.held]), ())
     held = np.asarray(KDTree(known.train.q).query(data.q)[0]) > MAX_REPEAT_DISTANCE
     said = (
         f"{data.source}: is not the file of the fit; {int((~held).sum())} of its {data.poses} rows "
         "have the joints of a training pose, the others count as held out"
     )
-    return held, (said,)
+    return UnseenPoses(held, (said,))
+
+
+class TrainingPoseCount(NamedTuple):
+    """How many poses a fit was made of, and notices on it."""
+
+    pose_count: int
+    notices: tuple[str, ...]
 
 
 def count_training_poses(
     data: Measurements, known: OpenedResult, error: Array
-) -> tuple[int, tuple[str, ...]]:
+) -> TrainingPoseCount:
     """How many of the poses a fit was made of, and a notice that they are no new ones.
 
     error: (m, k, 3) of the poses [m].
     """
     if not known.data.poses:
-        return 0, ()
+        return TrainingPoseCount(0, ())
     held = find_unseen_poses(data, known)[0]
     count = int((~held).sum())
     if not count:
-        return 0, ()
+        return TrainingPoseCount(0, ())
     said = f"{data.source}: {count} of {data.poses} poses are training poses of the fit, which it "
     said += "meets better than new ones"
     if held.any():
         others = summarise_point_errors(error[held])
         said += f"; the others: RMS {others.rms_mm:.4f} mm, largest {others.max_mm:.4f} mm"
-    return count, (said,)
+    return TrainingPoseCount(count, (said,))
 
 
 def check_saved_errors(known: OpenedResult) -> None:
@@ -366,9 +390,16 @@ def check_saved_errors(known: OpenedResult) -> None:
         )
 
 
+class PlacedNominalCell(NamedTuple):
+    """The arm before calibration in its place, and notices on it."""
+
+    cell: Cell
+    notices: tuple[str, ...]
+
+
 def place_nominal_cell(
     cell: Cell, before: Cell | None, train: Measurements, nominal: str, source: str
-) -> tuple[Cell, tuple[str, ...]]:
+) -> PlacedNominalCell:
     """The arm before calibration in its place: the result's, else as it fits poses best; notices.
 
     before: that of the result.  train: the training poses.  nominal: its robot, "" for the
@@ -379,7 +410,7 @@ def place_nominal_cell(
             raise CalibrationError(
                 f"{source}: does not tell its nominal robot; name it (`nominal`)"
             )
-        return before, ()
+        return PlacedNominalCell(before, ())
     robot = load_robot(nominal)
     missing = [name for name in cell.target_names if name not in train.target_names]
     if missing:
@@ -389,4 +420,6 @@ def place_nominal_cell(
         build_point_model(robot, cell.align_to_first_session(train)), robot.mdh
     ).state
     said = f"{robot.name} before calibration is placed where it fits {train.poses} poses best"
-    return Cell.from_parameters(robot, state, train.target_names, sessions=cell.sessions), (said,)
+    return PlacedNominalCell(
+        Cell.from_parameters(robot, state, train.target_names, sessions=cell.sessions), (said,)
+    )

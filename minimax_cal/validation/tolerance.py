@@ -84,7 +84,7 @@ class LimitJudgement:
     why: str
 
     @property
-    def plain(self) -> bool:
+    def is_explained_by_numbers(self) -> bool:
         """Whether the numbers alone say why."""
         return self.verdict == PASSED or self.bound.value > self.limit.size_mm
 
@@ -94,7 +94,7 @@ class LimitJudgement:
         return f"{kind} error at most {self.limit.size_mm:g} mm: {self.verdict} ({self.why})"
 
 
-def parse_limits(text: str) -> tuple[ToleranceLimit, ...]:
+def parse_tolerance_limits(text: str) -> tuple[ToleranceLimit, ...]:
     """Requirements as ``rms 0.2, max 0.5`` in millimetres.  Raises OptionError."""
     out = []
     for part in filter(str.strip, text.split(",")):

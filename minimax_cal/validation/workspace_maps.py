@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import scipy
@@ -54,7 +54,7 @@ MIN_INSIDE_FRACTION = 0.5  # a joint that moved over less of its range is worth 
 LEVEL, DOUBT = 0.95, 0.01  # share that the radius holds; chance of as few, below which it is told
 
 
-def predict_unknown(q: Array) -> Array:
+def predict_nan_radius(q: Array) -> Array:
     """The prediction of a fit that does not tell its covariance: (m,) NaN."""
     return np.full(len(q), np.nan)
 
@@ -232,7 +232,14 @@ def median_quantile_and_max_mm(values: Array) -> tuple[float, float, float]:
     return float(np.median(known)), float(np.quantile(known, 0.95)), float(known.max())
 
 
-def sampled_joint_range(robot: Robot, q: Array) -> tuple[Array, Array]:
+class SampledRange(NamedTuple):
+    """(n,) lowest and highest joint values to sample [rad, m]."""
+
+    lower: Array
+    upper: Array
+
+
+def sampled_joint_range(robot: Robot, q: Array) -> SampledRange:
     """(n,) lowest and highest joint values to sample: the limits, at most one turn [rad, m].
 
     q: (m, n) poses that say what to sample where a limit is not known; m may be 0.
@@ -246,7 +253,7 @@ def sampled_joint_range(robot: Robot, q: Array) -> tuple[Array, Array]:
         high = np.maximum(high, np.minimum(high + more, turn))
     lower = np.where(np.isfinite(robot.lower), robot.lower, low)
     upper = np.where(np.isfinite(robot.upper), robot.upper, high)
-    return clip_range_near_zero(lower, upper, turn)
+    return SampledRange(*clip_range_near_zero(lower, upper, turn))
 
 
 def tcp_positions(cell: Cell, q: Array) -> Array:
@@ -255,7 +262,7 @@ def tcp_positions(cell: Cell, q: Array) -> Array:
     return np.asarray(pose[:, :3, :3] @ cell.target_positions.mean(axis=0) + pose[:, :3, 3])
 
 
-def is_inside_training_poses(train: Array, q: Array) -> Array:
+def is_interpolated_by_training_poses(train: Array, q: Array) -> Array:
     """(m,) True where a pose lies among the training poses: interpolation, not extrapolation.
 
     Every joint is within its range in the training poses, and the nearest of them is no farther
@@ -289,42 +296,53 @@ def sample_joint_workspace(
     away = is_outside_narrow_spans(spans, q)
     radius = np.where(away, np.nan, radius)
     return SampledJoints(
-        tcp_positions(cell, q), radius, is_inside_training_poses(train, q) & ~away, away
+        tcp_positions(cell, q), radius, is_interpolated_by_training_poses(train, q) & ~away, away
     )
 
 
 def bin_section(
-    name: str, axes: tuple[str, str], at: tuple[Array, Array], some: SampledJoints, size: float
+    name: str,
+    axes: tuple[str, str],
+    coordinates: tuple[Array, Array],
+    samples: SampledJoints,
+    bin_size: float,
 ) -> MapSection:
-    """Samples binned into squares.  at: (N,) coordinates of each [m].  size: of a bin [m]."""
+    """Samples binned into squares.  coordinates: (N,) coordinates of each [m].  bin_size: of a bin
+    [m].
+    """
     edges = [
-        size * np.arange(np.floor(part.min() / size), np.ceil(part.max() / size) + 1.5)
-        for part in at
+        bin_size * np.arange(np.floor(part.min() / bin_size), np.ceil(part.max() / bin_size) + 1.5)
+        for part in coordinates
     ]
 
-    every = np.ones(len(some.radius), dtype=bool)
+    every = np.ones(len(samples.radius), dtype=bool)
 
     def binned(
         values: Array, statistic: Literal["count", "mean", "median", "max"], mask: Array = every
     ) -> Array:
-        x, y = (part[mask] for part in at)
+        x, y = (part[mask] for part in coordinates)
         found = scipy.stats.binned_statistic_2d(x, y, values[mask], statistic=statistic, bins=edges)
         return np.asarray(found.statistic, dtype=float)
 
-    count = binned(some.radius, "count").astype(int)
-    reached, away = (binned(mask.astype(float), "mean") for mask in (some.reached, some.outside))
+    count = binned(samples.radius, "count").astype(int)
+    reached, away = (
+        binned(mask.astype(float), "mean") for mask in (samples.reached, samples.outside)
+    )
     median = worst = np.full(count.shape, np.nan)
-    known = np.isfinite(some.radius)
+    known = np.isfinite(samples.radius)
     if known.any():
-        median, worst = binned(some.radius, "median", known), binned(some.radius, "max", known)
+        median, worst = (
+            binned(samples.radius, "median", known),
+            binned(samples.radius, "max", known),
+        )
     return MapSection(name, axes, (edges[0], edges[1]), count, median, worst, reached, away)
 
 
 def build_workspace_map(
     saved: SavedResult,
-    predict: Predict = predict_unknown,
+    predict: Predict = predict_nan_radius,
     grid: MapGrid = MapGrid(),
-    measured: Predict = predict_unknown,
+    measured: Predict = predict_nan_radius,
 ) -> WorkspaceMap:
     """Sections through the workspace of a saved calibration.
 
@@ -351,16 +369,22 @@ def build_workspace_map(
     return WorkspaceMap(cell.robot.name, sections, some, seen, height, slab, inside, notices)
 
 
-def build_sections(
-    some: SampledJoints, grid: MapGrid, reach: float
-) -> tuple[tuple[MapSection, ...], float, float]:
+class MapSections(NamedTuple):
+    """Sections, and the height and thickness of the horizontal one [m]."""
+
+    sections: tuple[MapSection, ...]
+    height: float
+    slab: float
+
+
+def build_sections(samples: SampledJoints, grid: MapGrid, reach: float) -> MapSections:
     """The vertical and the horizontal section, and height and thickness of the latter [m].
 
     reach: of the arm [m].  Raises OptionError.
     """
-    height = grid.height if np.isfinite(grid.height) else float(np.median(some.place[:, 2]))
+    height = grid.height if np.isfinite(grid.height) else float(np.median(samples.place[:, 2]))
     slab = grid.slab if np.isfinite(grid.slab) else 0.2 * reach
-    x, y, z = some.place.T
+    x, y, z = samples.place.T
     flat = np.abs(z - height) <= 0.5 * slab
     if not flat.any():
         raise OptionError(
@@ -370,10 +394,10 @@ def build_sections(
     size = float(max(2.0 * np.hypot(x, y).max(), np.ptp(z))) / grid.bins
     upright, level = ("distance from axis 1 (m)", "height (m)"), ("x (m)", "y (m)")
     sections = (
-        bin_section("vertical", upright, (np.hypot(x, y), z), some, size),
-        bin_section("horizontal", level, (x[flat], y[flat]), some.take(flat), size),
+        bin_section("vertical", upright, (np.hypot(x, y), z), samples, size),
+        bin_section("horizontal", level, (x[flat], y[flat]), samples.take(flat), size),
     )
-    return sections, height, slab
+    return MapSections(sections, height, slab)
 
 
 def observed_errors(saved: SavedResult) -> ObservedErrors:

@@ -14,13 +14,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, cast
 
-from minimax_cal.core.display_text import shorten_to_one_line
+from minimax_cal.core.display_text import clean_and_shorten_to_one_line
 from minimax_cal.core.errors import CalibrationError, OptionError
 from minimax_cal.core.files import (
+    convert_to_plain_json,
     create_folder,
     format_json,
     parse_json,
-    to_plain_json,
     write_file_atomically,
 )
 from minimax_cal.core.progress_stages import format_duration
@@ -112,7 +112,7 @@ class StepJob:
         elif kind == "written":
             self.more |= {k: str(v) for k, v in event.items() if k not in ("event", "text")}
         elif not kind and text:
-            self.other.append(shorten_to_one_line(text))
+            self.other.append(clean_and_shorten_to_one_line(text))
 
     def build_progress_json(self) -> dict[str, Any]:
         """For the page."""
@@ -162,7 +162,7 @@ class JobRunner:
             if not (job.cancelled and code):  # what ended well was cancelled too late
                 await asyncio.to_thread(write_step_record_and_script, job, code, told, inputs)
         except (OSError, CalibrationError) as error:  # no room, or no process to be had
-            job.error = shorten_to_one_line(f"the work could not be done ({error})")
+            job.error = clean_and_shorten_to_one_line(f"the work could not be done ({error})")
             with suppress(OSError, CalibrationError):
                 write_step_record_and_script(job, 1, told, inputs)
         finally:
@@ -266,7 +266,7 @@ def write_step_record_and_script(
     )
     write_file_atomically(
         create_folder(job.session.folder / LOG_FOLDER) / f"{job.step}.json",
-        format_json(to_plain_json(record)),
+        format_json(convert_to_plain_json(record)),
     )
     script = job.session.folder / SCRIPT_FILE
     text = script.read_text("utf-8") if script.exists() else script_header(job.session.folder)

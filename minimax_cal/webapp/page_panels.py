@@ -9,7 +9,7 @@ from typing import Any
 
 from numpy import nan_to_num
 
-from minimax_cal.core.display_text import capitalise_sentence, replace_control_characters
+from minimax_cal.core.display_text import capitalise_sentence, replace_invisible_and_bidi_characters
 from minimax_cal.core.errors import CalibrationError
 from minimax_cal.core.files import parse_json
 from minimax_cal.core.tables import Table, drop_empty_tables
@@ -191,7 +191,7 @@ def build_import_panel(
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise CalibrationError(f"{path}: is not the JSON of an import") from error
     return {
-        "headline": replace_control_characters(headline),
+        "headline": replace_invisible_and_bidi_characters(headline),
         "tables": tables,
         "notices": content["notices"],
     }
@@ -207,9 +207,12 @@ def describe_imported_file(file_record: dict[str, Any]) -> tuple[str, Table]:
     columns = file_record["columns"]
     header = tuple(columns[0]) if columns else ("column",)
     rows = tuple(
-        tuple(replace_control_characters(str(v)) for v in column.values()) for column in columns
+        tuple(replace_invisible_and_bidi_characters(str(v)) for v in column.values())
+        for column in columns
     )
-    return replace_control_characters(line), Table(str(file_record["file"]), header, rows)
+    return replace_invisible_and_bidi_characters(line), Table(
+        str(file_record["file"]), header, rows
+    )
 
 
 def build_robot_panel(

@@ -16,7 +16,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from minimax_cal.core.display_text import replace_control_characters, shorten_to_one_line
+from minimax_cal.core.display_text import (
+    clean_and_shorten_to_one_line,
+    replace_invisible_and_bidi_characters,
+)
 from minimax_cal.core.errors import CalibrationError, OptionError
 from minimax_cal.core.files import format_json, parse_json, read_bytes, write_file_atomically
 from minimax_cal.measuring.importers import read_in_first_fitting_format
@@ -132,13 +135,15 @@ class Session:
         except ValidationError as error:
             first = error.errors()[0]
             where = ".".join(map(str, first["loc"]))
-            raise OptionError(shorten_to_one_line(f"{where}: {first['msg']}")) from error
+            raise OptionError(clean_and_shorten_to_one_line(f"{where}: {first['msg']}")) from error
         for name in (
             made.named_files() - now.named_files()
         ):  # of one that is gone since, its command will say
             known = name in builtin_robots() and name == made.robot
             if name and not known and not self.resolve_file(UPLOAD_FOLDER, name).is_file():
-                raise OptionError(f"{replace_control_characters(name)}: was not dropped here")
+                raise OptionError(
+                    f"{replace_invisible_and_bidi_characters(name)}: was not dropped here"
+                )
         return made
 
     def resolve_file(self, *parts: str) -> Path:
@@ -271,7 +276,7 @@ def is_complete_file(path: Path) -> bool:
 
 def check_file_name(name: str) -> str:
     """A file's name, if it is no more than that.  Raises OptionError."""
-    shown = shorten_to_one_line(name)[:60]
+    shown = clean_and_shorten_to_one_line(name)[:60]
     if "/" in name or "\\" in name or name in (".", ".."):
         raise OptionError(f"file name {shown!r}: holds a path; give the name alone")
     long = len(name.encode("utf-8", "replace")) > MAX_FILE_NAME_BYTES
@@ -291,7 +296,7 @@ def open_session(sessions_folder: Path, session_name: str) -> Session:
     """A session that is there.  Raises OptionError."""
     folder = sessions_folder / session_name
     if not SESSION_NAME_PATTERN.fullmatch(session_name) or not (folder / UPLOAD_FOLDER).is_dir():
-        raise OptionError(f"no session {shorten_to_one_line(session_name)[:60]!r}")
+        raise OptionError(f"no session {clean_and_shorten_to_one_line(session_name)[:60]!r}")
     return Session(folder)
 
 

@@ -45,7 +45,7 @@ from minimax_cal.diagnosing.verdict import (
 from minimax_cal.fitting.accuracy import Accuracy
 from minimax_cal.fitting.data_slips import correct_misplaced_rows, match_misplaced_rows
 from minimax_cal.fitting.noise_floor import AT_MOST, REPEATS, NoiseFloor
-from minimax_cal.modelling.arm_laws import build_arm_library
+from minimax_cal.modelling.arm_laws import build_library_of_testable_arm_laws
 from minimax_cal.modelling.cell import Cell, build_measurements_at_rest
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.simulate import Simulation
@@ -483,7 +483,7 @@ def geared() -> tuple[LinearisedGeometry, FoundCauses]:
             GapCase("irb2600", "single", (GapCause("gear_error", "J1", 300.0),), seed=4)
         )
     )
-    choice = select_effects_by_evidence(build_arm_library(study.scene, study.rows))
+    choice = select_effects_by_evidence(build_library_of_testable_arm_laws(study.scene, study.rows))
     return study, FoundCauses((), (), choice, (), (NO_REMAINING_COMPONENT,), ())
 
 

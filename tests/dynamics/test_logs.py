@@ -21,7 +21,12 @@ from minimax_cal.dynamics.known_inputs import (
     compute_gravity_torques,
     read_checked_runs,
 )
-from minimax_cal.dynamics.logs import are_logs, format_runs_csv, read_log_files, read_runs
+from minimax_cal.dynamics.logs import (
+    are_logs,
+    format_runs_csv_in_rad_and_mm,
+    read_log_files,
+    read_runs,
+)
 
 N = 3
 WRITTEN = 1e-6  # rounding of the numbers in the files
@@ -181,7 +186,9 @@ def test_what_is_written_is_read_again(tmp_path: Path) -> None:
     other["t_s"] = slides["t_s"]
     found = read_log_files([write(tmp_path / "a.csv", slides), write(tmp_path / "b.csv", other)])
     assert found.is_prismatic.tolist() == [False, True, False]
-    (tmp_path / "both.csv").write_text(format_runs_csv(found.runs, found.is_prismatic))
+    (tmp_path / "both.csv").write_text(
+        format_runs_csv_in_rad_and_mm(found.runs, found.is_prismatic)
+    )
     again = read_log_files(tmp_path / "both.csv")
     assert [run.name for run in again.runs] == ["both:a", "both:b"]
     assert again.is_prismatic.tolist() == found.is_prismatic.tolist()

@@ -11,7 +11,7 @@ from minimax_cal.core.linear_algebra import project_out
 from minimax_cal.dynamics.regressor import JointMotion
 from minimax_cal.dynamics.residual_structure import (
     MotionHistory,
-    compute_predicted_square_share,
+    predicted_share_and_p_value,
     project_out_model_and_normalise,
 )
 from minimax_cal.dynamics.torque_rows import (
@@ -38,10 +38,10 @@ def test_columns_foretell_what_holds_in_every_group_and_never_noise() -> None:
     chances = []
     for _ in range(30):
         noise, field = red(rng), rng.normal(size=(len(GROUP), 20))
-        share, p = compute_predicted_square_share(field, noise, GROUP, GROUP)
+        share, p = predicted_share_and_p_value(field, noise, GROUP, GROUP)
         assert share < 0.1
         chances.append(p)
-        there, sure = compute_predicted_square_share(field, noise + field[:, 3], GROUP, GROUP)
+        there, sure = predicted_share_and_p_value(field, noise + field[:, 3], GROUP, GROUP)
         assert there == pytest.approx(0.5, abs=0.1)
         assert sure < 1e-4
     assert min(chances) > 1e-3
@@ -51,7 +51,7 @@ def test_one_group_alone_is_no_evidence() -> None:
     rng = np.random.default_rng(3)
     field, left = rng.normal(size=(len(GROUP), 5)), 0.1 * rng.normal(size=len(GROUP))
     left += 10.0 * field[:, 0] * (GROUP == 4)
-    assert compute_predicted_square_share(field, left, GROUP, GROUP)[1] > 0.05
+    assert predicted_share_and_p_value(field, left, GROUP, GROUP)[1] > 0.05
 
 
 def test_what_the_model_imitates_is_no_probe() -> None:

@@ -22,7 +22,7 @@ from minimax_cal.measuring.visit_history import add_history_columns
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.gear_periodogram import (
     WaveScore,
-    find_strongest_gear_lines,
+    find_gear_lines_with_tried_counts,
     has_line_near_expected_ratio,
     is_line_near_expected_ratio,
     line_bands_of_like_gears,
@@ -86,7 +86,7 @@ def test_lines_near_a_ratio_are_few():
     assert line_bands_of_ratio(120.0) == [(119.0, 121.0), (238.0, 242.0)]
     made = opened("irb120")
     none = np.zeros((len(made.rows.error), 0))
-    found = find_strongest_gear_lines(
+    found = find_gear_lines_with_tried_counts(
         made.scene, made.rows, estimate_noise_by_reml(made.rows, none), none
     )
     tries = sorted({tries for _, tries in found})

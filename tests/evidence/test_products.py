@@ -18,7 +18,7 @@ from minimax_cal.fitting.cell_fit import fit_cell
 from minimax_cal.fitting.options import Options, silent_progress
 from minimax_cal.measuring.pose_groups import split_train_and_holdout
 from minimax_cal.measuring.visit_history import add_history_columns
-from minimax_cal.modelling.arm_laws import ArmLaws, build_arm_library
+from minimax_cal.modelling.arm_laws import ArmLaws, build_library_of_testable_arm_laws
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.gear_periodogram import sum_wave_products
 from minimax_cal.selection import noise_model
@@ -65,7 +65,7 @@ def rough() -> LinearisedGeometry:
 
 @pytest.fixture(scope="module")
 def lib(rough: LinearisedGeometry) -> CandidateLibrary:
-    return build_arm_library(rough.scene, rough.rows)
+    return build_library_of_testable_arm_laws(rough.scene, rough.rows)
 
 
 @pytest.mark.parametrize("decade", [-3, 0, 4])
@@ -96,7 +96,7 @@ def check_sums(products: Any, ratios: Array, variance_ratio: Array, kept: Array 
 
 
 def test_products_are_the_sums_over_rows(rough):
-    products = build_arm_library(rough.scene, rough.rows).products
+    products = build_library_of_testable_arm_laws(rough.scene, rough.rows).products
     check_sums(products, TRIED, rough.rows.variance_ratio, 1.0)
 
 
@@ -111,7 +111,7 @@ def test_columns_are_stored_without_what_geometry_imitates(lib, rough):
 
 def test_what_is_left_of_a_column_is_that_of_the_column_and_geometry(rough):
     """A thousand times as much geometry in it changes no product; geometry alone leaves least."""
-    products = build_arm_library(rough.scene, rough.rows).products
+    products = build_library_of_testable_arm_laws(rough.scene, rough.rows).products
     columns, basis = products.columns, rough.rows.nuisance_basis
     column = columns.candidate_columns[:, 3]
     more = 1e3 * np.linalg.norm(column) * basis[:, 0]
@@ -164,7 +164,7 @@ def test_waves_on_a_grid_are_sums_over_poses(rng):
 def test_products_know_no_order_of_columns(rng):
     """Columns that come later have the same products as those that were there before."""
     quiet = study(6e-6, 1.0, 0)
-    early = build_arm_library(quiet.scene, quiet.rows)
+    early = build_library_of_testable_arm_laws(quiet.scene, quiet.rows)
     late = CandidateLibrary.without_candidates(ArmLaws(quiet.scene, quiet.rows))
     terms = [c.term for c in early.candidates][:6]
     for term in terms:  # one by one, products asked for in between
@@ -202,7 +202,7 @@ NEAR = 0.5  # relative difference of a ratio among few from the likeliest of all
 
 @pytest.fixture(scope="module")
 def whole(rough: LinearisedGeometry) -> EffectSelection:
-    return select_effects_by_evidence(build_arm_library(rough.scene, rough.rows))
+    return select_effects_by_evidence(build_library_of_testable_arm_laws(rough.scene, rough.rows))
 
 
 @pytest.fixture(scope="module")
@@ -319,7 +319,7 @@ def test_a_part_names_what_its_rows_alone_name(third, causes, poses):
     made = study_of(
         build_and_measure_arm(GapCase("irb2600", "single", causes, seed=5, poses=poses))
     )
-    choice = select_effects_by_evidence(build_arm_library(made.scene, made.rows))
+    choice = select_effects_by_evidence(build_library_of_testable_arm_laws(made.scene, made.rows))
     kept = made.rows.row_mask_of_poses(np.arange(made.data.poses) % 3 != third)
     part = choice.take_rows(kept)
     found = select_effects_by_evidence(part)
@@ -338,7 +338,9 @@ def test_a_part_tunes_again_what_it_ends_with():
             GapCase("irb2600", "single", (GapCause("target_shift", "smr2", 1000.0),))
         )
     )
-    choice = select_effects_by_evidence(build_arm_library(sealed.scene, sealed.rows))
+    choice = select_effects_by_evidence(
+        build_library_of_testable_arm_laws(sealed.scene, sealed.rows)
+    )
     (one,) = choice.candidates
     clock = sealed.scene.data.columns["clock"]
     away = np.abs(clock - one.term.choice["since"]) < 0.05 * np.ptp(clock)
@@ -355,7 +357,7 @@ def test_a_part_tunes_again_what_it_ends_with():
 def test_a_part_that_shows_hardly_anything_of_a_cause_does_not_test_it():
     """A nest that moved late, and poses from before: rounding is left of its columns."""
     made = study(jitter=0.0, noise=1.0, seed=3)
-    choice = select_effects_by_evidence(build_arm_library(made.scene, made.rows))
+    choice = select_effects_by_evidence(build_library_of_testable_arm_laws(made.scene, made.rows))
     shift = next(c for c in choice.library.candidates if c.term.effect == "target_shift")
     since = made.scene.data.columns["clock"] < shift.term.choice["since"]
     part = choice.take_rows(made.rows.row_mask_of_poses(since))

@@ -25,7 +25,7 @@ from minimax_cal.fitting.cell_fit import fit_cell
 from minimax_cal.fitting.options import Options, silent_progress
 from minimax_cal.measuring.pose_groups import split_train_and_holdout
 from minimax_cal.measuring.visit_history import add_history_columns
-from minimax_cal.modelling.arm_laws import ArmLaws, build_arm_library
+from minimax_cal.modelling.arm_laws import ArmLaws, build_library_of_testable_arm_laws
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.simulate import Truth, simulate
 from minimax_cal.robots.gravity_torques import link_masses_and_centres
@@ -152,7 +152,7 @@ def test_two_effects_that_are_both_there_are_no_rivals():
     """Fits as good as one another, of which each is needed beside the other."""
     names = (("encoder_gain", "J2"), ("backlash", "J2"))
     made = opened(*(GapCause(*name, 300.0) for name in names), seed=4)
-    lib = build_arm_library(made.scene, made.rows)
+    lib = build_library_of_testable_arm_laws(made.scene, made.rows)
     table = build_candidate_tests(lib, ())
     pair = [next(c for c in lib.candidates if c.key == name) for name in names]
     for one, other in (pair, pair[::-1]):
@@ -172,7 +172,7 @@ def test_a_cause_and_what_resembles_it_stay_rivals():
     """The one that is not there is of no use beside the truth, five times of five."""
     for seed in range(5):
         made = opened(GapCause("joint_compliance", "J2", 400.0), seed=seed)
-        lib = build_arm_library(made.scene, made.rows)
+        lib = build_library_of_testable_arm_laws(made.scene, made.rows)
         table = build_candidate_tests(lib, ())
         names = (("joint_compliance", "J2"), ("base_flex", "frame"))
         truth, like = (next(c for c in lib.candidates if c.key == name) for name in names)
@@ -196,7 +196,7 @@ def test_lambda_is_the_one_that_was_asked_for():
 def test_values_are_those_of_least_squares():
     """Without jitter the fit beside the geometry is plain least squares on both."""
     made = opened(GapCause("encoder_gain", "J2", 500.0), seed=8)
-    lib = build_arm_library(made.scene, made.rows)
+    lib = build_library_of_testable_arm_laws(made.scene, made.rows)
     c = next(c for c in lib.candidates if c.key == ("encoder_gain", "J2"))
     settings = forward_selection.build_candidate_tests(lib, ()).projected_products
     still = int(np.flatnonzero(settings.noise_ratios == 0.0)[0])
@@ -256,7 +256,7 @@ def test_a_tool_on_the_axis_needs_no_levers():
 def test_what_signs_cost_is_the_rise_of_the_bounded_square():
     """Against least squares with bounds on all rows: no compliance below 0."""
     made = yielding(opened(seed=5), np.array([0.0, 0.0, 0.1]), -SOFT)
-    lib = build_arm_library(made.scene, made.rows)
+    lib = build_library_of_testable_arm_laws(made.scene, made.rows)
     terms = ["joint_compliance:all", "backlash:J1", "link_bending:L2"]
     found = {c.term.label: c for c in lib.candidates if not c.term.choice.get("tool")}
     fits, chosen_ = [], []
@@ -474,7 +474,7 @@ def test_motions_that_differ_at_one_pose_are_two(shifted):
 
 def test_a_nest_moved_at_the_pose_at_which_it_did(shifted):
     found = select_effects_by_evidence(
-        build_arm_library(shifted.scene, shifted.rows, ("gear_ripple",))
+        build_library_of_testable_arm_laws(shifted.scene, shifted.rows, ("gear_ripple",))
     ).candidates
     clock = np.sort(shifted.scene.column("clock"))
     assert [c.term.label for c in found] == ["target_shift:smr1"]

@@ -21,7 +21,7 @@ from experiments.gap_cases import (
 from experiments.machines import MACHINE_LAWS as SHOP_LAWS
 from experiments.machines import MACHINE_MAKES, MachineCase
 from minimax_cal.core.arrays import Array
-from minimax_cal.core.files import to_plain_json
+from minimax_cal.core.files import convert_to_plain_json
 
 # ---- gap cases -----------------------------------------------------------------------------------
 
@@ -286,7 +286,7 @@ def test_score_of_single_answers():
     assert (row["all_right"], row["all_in_sets"], row["strange"]) == (False, True, 1)
     row = blind_gap.score_answer(case, truth_of(J2), answer("unknown"))
     assert (row["match"], row["in_set"], row["set_size"]) == ("", False, 0)
-    json.dumps(to_plain_json(row), allow_nan=False)
+    json.dumps(convert_to_plain_json(row), allow_nan=False)
 
 
 def test_score_of_several_effects():

@@ -14,7 +14,7 @@ from scipy import stats
 
 import minimax_cal as mc
 from minimax_cal.core.arrays import Array
-from minimax_cal.core.files import to_plain_json
+from minimax_cal.core.files import convert_to_plain_json
 from minimax_cal.fitting import region_holdout
 from minimax_cal.fitting.accuracy import (
     Interval,
@@ -80,7 +80,7 @@ def test_a_part_is_judged_by_a_fit_without_it(robot, noisy, objective):
     assert_allclose(found.typical_mm**2, (poses * rms**2).sum() / poses.sum(), rtol=1e-12)
     assert found.worst_mm == found.worst.rms_mm == max(rms)
     assert len(found.spans) == 6
-    assert (found.narrow_spans, to_plain_json(found)["plan"]) == ((), None)
+    assert (found.narrow_spans, convert_to_plain_json(found)["plan"]) == ((), None)
 
 
 def test_effects_stand_beside_geometry_alone(robot):
@@ -154,8 +154,8 @@ def test_parts_that_none_can_judge_are_counted_and_named(robot):
         in found.sentence()
     )
     assert found.table().rows[-1][0] == f"{len(found.folds)} of {made} parts"
-    assert to_plain_json(found)["not_judged"] == list(found.missed)
-    assert to_plain_json(found)["effects_sought_anew"] is None
+    assert convert_to_plain_json(found)["not_judged"] == list(found.missed)
+    assert convert_to_plain_json(found)["effects_sought_anew"] is None
 
 
 @pytest.mark.parametrize("seed", [2, 5])

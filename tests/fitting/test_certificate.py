@@ -192,7 +192,7 @@ def test_the_points_that_decide_are_named(robot, noisy):
     assert np.count_nonzero(distance > proof.value * (1 - 1e-6)) == len(proof.points)
     text = proof.table().text()
     assert f"{1e3 * proof.value:.4f} mm" in text
-    content = files.to_plain_json(proof)
+    content = files.convert_to_plain_json(proof)
     assert content["points"][0]["line"] == proof.points[0].line
     assert_allclose(content["value_mm"], 1e3 * proof.value)
 

@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import minimax_cal as mc
 from minimax_cal.core.arrays import Array
 from minimax_cal.core.display_text import capitalise_sentence
-from minimax_cal.core.files import to_plain_json
+from minimax_cal.core.files import convert_to_plain_json
 from minimax_cal.core.record_fields import (
     derived_field_formats,
     format_record_fields,
@@ -157,7 +157,7 @@ def test_a_file_without_poses(fit, tmp_path):
     assert [p.name for p in back.parameters] == [p.name for p in fit.parameters]
     assert_same(back.parameters.value, fit.parameters.value)
     assert back.accuracy["train"].sse_mm2 == fit.accuracy["train"].sse_mm2
-    assert to_plain_json(back.beyond) == to_plain_json(fit.beyond)
+    assert convert_to_plain_json(back.beyond) == convert_to_plain_json(fit.beyond)
     assert not back.data.poses
     assert_same(back.predict(fit.data.q[:3]), fit.predict(fit.data.q[:3]))
 
@@ -364,7 +364,7 @@ def test_a_fit_comes_back_whole_from_another_process():
     fit = mc.calibrate("irb120", mc.simulate("irb120", 40, 1, 0).data)
     again = pickle.loads(pickle.dumps(fit))
     assert_array_equal(again.error, fit.error)
-    assert to_plain_json(again.beyond) == to_plain_json(fit.beyond)
+    assert convert_to_plain_json(again.beyond) == convert_to_plain_json(fit.beyond)
 
 
 def test_robots_and_data_are_as_many():

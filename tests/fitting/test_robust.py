@@ -340,7 +340,7 @@ def test_targets_that_follow_are_not_judged(robot):
     """As with objective smr:2: the others have a weight that is nothing beside one."""
     case = shifted(robot, 0.1, 1e-3)
     model, plain = FITTER(
-        case.model.weight_targets(np.array([1e-9, 1.0, 1e-9])), state_of(case.found)
+        case.model.with_target_weights(np.array([1e-9, 1.0, 1e-9])), state_of(case.found)
     )
     judged = np.array([False, True, False])
     found = fit_robust_loss(FITTER, model, plain, case.data.line, "tukey", is_judged=judged)

@@ -13,7 +13,7 @@ from scipy import stats
 
 import minimax_cal as mc
 from minimax_cal.core.arrays import Array
-from minimax_cal.core.files import to_plain_json
+from minimax_cal.core.files import convert_to_plain_json
 from minimax_cal.fitting.outliers import (
     FALSE_DISCOVERY_RATE,
     PointScores,
@@ -394,7 +394,7 @@ def test_suspects_of_a_file_come_back(robot, noisy, tmp_path):
     again = mc.load_fit(tmp_path / "fit.json")
     keys = [[(s.line, s.target, s.held) for s in one.suspects] for one in (fit, again)]
     assert keys[0] == keys[1]
-    assert to_plain_json(again.beyond) == to_plain_json(fit.beyond)
+    assert convert_to_plain_json(again.beyond) == convert_to_plain_json(fit.beyond)
     assert again.trusted.rms_mm == pytest.approx(fit.trusted.rms_mm, rel=1e-9)
 
 

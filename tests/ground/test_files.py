@@ -9,13 +9,13 @@ from typing import Any
 import pytest
 
 from minimax_cal.core.errors import CalibrationError, DataError
-from minimax_cal.core.files import check_writable, read_bytes, read_text, write_file_atomically
+from minimax_cal.core.files import check_output_path, read_bytes, read_text, write_file_atomically
 
 
 def test_links_in_a_circle_are_said(tmp_path):
     loop = tmp_path / "loop"
     loop.symlink_to(loop)
-    for write in (check_writable, lambda path: write_file_atomically(path, "text")):
+    for write in (check_output_path, lambda path: write_file_atomically(path, "text")):
         with pytest.raises(CalibrationError, match="its links lead nowhere"):
             write(loop)
 
@@ -45,8 +45,8 @@ def test_lines_end_alike(tmp_path):
 def test_a_name_may_be_long_and_not_longer(tmp_path):
     write_file_atomically(tmp_path / ("n" * 255), "text")
     assert os.listdir(tmp_path) == ["n" * 255]
-    check_writable(tmp_path / ("n" * 254))
-    for write in (check_writable, lambda path: write_file_atomically(path, "text")):
+    check_output_path(tmp_path / ("n" * 254))
+    for write in (check_output_path, lambda path: write_file_atomically(path, "text")):
         with pytest.raises(CalibrationError, match="its name is too long"):
             write(tmp_path / ("n" * 300))
     assert os.listdir(tmp_path) == ["n" * 255]

@@ -5,10 +5,10 @@ import pytest
 from numpy.testing import assert_allclose
 
 from minimax_cal.core.linear_algebra import (
-    column_scales,
+    column_norms_from_gram,
+    divide_by_scales,
     jackknife_variance,
     project_out,
-    scale_symmetric,
     schur_complement,
 )
 
@@ -37,11 +37,11 @@ def test_the_schur_complement_is_the_gram_matrix_of_residuals(
 def test_a_scaled_gram_matrix_is_that_of_scaled_columns(rng: np.random.Generator) -> None:
     columns = rng.normal(size=(2, 20, 5))
     gram = np.swapaxes(columns, 1, 2) @ columns
-    scale = column_scales(gram)
+    scale = column_norms_from_gram(gram)
     assert_allclose(scale, np.linalg.norm(columns, axis=1), rtol=1e-14)
     unit = columns / scale[:, None]
-    assert_allclose(scale_symmetric(gram, scale), np.swapaxes(unit, 1, 2) @ unit, atol=1e-14)
-    assert np.all(column_scales(np.zeros((3, 3))) > 0.0)
+    assert_allclose(divide_by_scales(gram, scale), np.swapaxes(unit, 1, 2) @ unit, atol=1e-14)
+    assert np.all(column_norms_from_gram(np.zeros((3, 3))) > 0.0)
 
 
 def test_the_jackknife_of_a_mean_is_its_standard_error(rng: np.random.Generator) -> None:

@@ -14,8 +14,8 @@ from minimax_cal.core.parallel import (
     CallTimer,
     WorkersLostError,
     deque,
-    fetch_result,
-    pop_chunks,
+    fetch_result_as_list,
+    pop_task_chunks,
     run_in_parallel,
 )
 
@@ -79,7 +79,7 @@ def test_brief_work_starts_no_process(monkeypatch):
 
 def test_chunks_shrink_towards_the_end():
     waiting = deque((squared, n, (n,)) for n in range(100))
-    sizes = [len(chunk) for chunk in pop_chunks(waiting, 0.05, 4)]
+    sizes = [len(chunk) for chunk in pop_task_chunks(waiting, 0.05, 4)]
     assert sum(sizes) == 100
     assert sizes[0] == 20  # a second
     assert sizes == sorted(sizes, reverse=True)
@@ -110,10 +110,10 @@ class Future:
 
 
 def test_a_result_that_is_lost_is_waited_for_again():
-    assert fetch_result(Future("finished", (3, "x")), TimeoutError) == [(3, "x")]
-    assert fetch_result(Future("finished", TimeoutError()), TimeoutError) == []
+    assert fetch_result_as_list(Future("finished", (3, "x")), TimeoutError) == [(3, "x")]
+    assert fetch_result_as_list(Future("finished", TimeoutError()), TimeoutError) == []
     with pytest.raises(TimeoutError):  # the call's own
-        fetch_result(Future("error", TimeoutError()), TimeoutError)
+        fetch_result_as_list(Future("error", TimeoutError()), TimeoutError)
 
 
 def test_calls_are_packed_where_others_are_made():

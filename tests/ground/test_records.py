@@ -14,7 +14,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from minimax_cal.core.arrays import Array
-from minimax_cal.core.files import format_json, to_plain_json
+from minimax_cal.core.files import convert_to_plain_json, format_json
 from minimax_cal.core.record_fields import (
     SEPARATE_FIELD_FORMAT,
     FieldFormat,
@@ -104,12 +104,12 @@ FILE = {
 
 
 def test_a_record_is_written_by_its_keys_and_units():
-    assert json.loads(format_json(to_plain_json(WIRE))) == FILE
+    assert json.loads(format_json(convert_to_plain_json(WIRE))) == FILE
 
 
 def test_a_record_comes_back_bit_by_bit():
     found = parse_record(Wire, FILE | {"later": "unknown to this version"})
-    assert to_plain_json(found) == FILE
+    assert convert_to_plain_json(found) == FILE
     assert (found.length, found.kind, found.hidden) == (1.25, Kind.THIN, None)
     assert math.isnan(found.ends.last)
     assert_array_equal(found.error, WIRE.error)

@@ -28,8 +28,8 @@ from minimax_cal.validation.workspace_maps import (
     bin_section,
     build_radius_predictor,
     build_workspace_map,
-    is_inside_training_poses,
-    predict_unknown,
+    is_interpolated_by_training_poses,
+    predict_nan_radius,
     sampled_joint_range,
     tcp_positions,
 )
@@ -149,7 +149,7 @@ def test_a_known_field_lies_between_the_edges_of_its_bin(saved):
 def test_reached_is_within_the_ranges_and_near(rng):
     train, q = rng.uniform(-1, 1, (40, 3)) * [1, 2, 3], rng.uniform(-4, 4, (300, 3))
     train = np.concatenate([train, train[:7]])  # poses that were visited again
-    found = is_inside_training_poses(train, q)
+    found = is_interpolated_by_training_poses(train, q)
     size = np.ptp(train, axis=0)
     own = np.linalg.norm((train[:40, None] - train[None, :40]) / size, axis=-1)
     own[np.diag_indices(40)] = np.inf
@@ -158,16 +158,18 @@ def test_reached_is_within_the_ranges_and_near(rng):
     inside = ((q >= train.min(axis=0)) & (q <= train.max(axis=0))).all(axis=1)
     assert_array_equal(found, inside & (away <= limit))
     assert 0 < found.sum() < 300
-    assert is_inside_training_poses(train, train).all()
+    assert is_interpolated_by_training_poses(train, train).all()
 
 
 def test_a_joint_that_never_moved_is_not_known_elsewhere():
     rng = np.random.default_rng(1)
     train = rng.uniform(-1, 1, (40, 3)) * [1, 1, 0] + [0, 0, 0.7]
     elsewhere = train + np.array([0, 0, 0.1])
-    assert is_inside_training_poses(train, train).all()
-    assert not is_inside_training_poses(train, elsewhere).any()
-    assert not is_inside_training_poses(train[:2], train).any()  # two poses tell no spacing
+    assert is_interpolated_by_training_poses(train, train).all()
+    assert not is_interpolated_by_training_poses(train, elsewhere).any()
+    assert not is_interpolated_by_training_poses(
+        train[:2], train
+    ).any()  # two poses tell no spacing
 
 
 def test_joints_are_sampled_within_their_limits(robot):
@@ -191,7 +193,7 @@ def test_other_arms(name):
     q = random_joint_values_above_floor(robot, 30, np.random.default_rng(0))
     data = replace(mc.measurements(q, cell.predict(q)), sliding=robot.prismatic)
     both = SavedResult({"before": cell, "after": cell}, data, np.zeros(30, dtype=bool), {}, ())
-    found = build_workspace_map(both, predict_unknown, SMALL)
+    found = build_workspace_map(both, predict_nan_radius, SMALL)
     assert found.sections[0].count.sum() == SMALL.samples + 30
     low, high = sampled_joint_range(robot, q)
     assert np.all(low < high)
@@ -200,7 +202,7 @@ def test_other_arms(name):
 
 
 def test_observed_errors_are_those_of_the_cells(saved):
-    found = build_workspace_map(saved, predict_unknown, SMALL)
+    found = build_workspace_map(saved, predict_nan_radius, SMALL)
     for name, cell in saved.cells.items():
         told = np.linalg.norm(cell.error(saved.data).mean(axis=1), axis=-1)
         assert_allclose(getattr(found.seen, name), told, atol=1e-15)
@@ -209,18 +211,18 @@ def test_observed_errors_are_those_of_the_cells(saved):
     gap = saved.data.y.copy()
     gap[3, 1] = np.nan
     part = build_workspace_map(
-        replace(saved, data=saved.data.with_y(gap)), predict_unknown, SMALL
+        replace(saved, data=saved.data.with_y(gap)), predict_nan_radius, SMALL
     ).seen
     one = saved.cells["after"].error(saved.data)[3, [0, 2]].mean(axis=0)
     assert_allclose(part.after[3], np.linalg.norm(one), atol=1e-15)
 
 
 def test_a_prediction_that_held_out_poses_belie_is_doubted(saved):
-    error = build_workspace_map(saved, predict_unknown, SMALL).seen.after[saved.held]
+    error = build_workspace_map(saved, predict_nan_radius, SMALL).seen.after[saved.held]
     few, more = np.sort(error)[[7, 8]]  # of 12 by chance: 8 in 0.2 %, 9 in 2 % of all cases
     for radius, count, doubted in ((few, 8, True), (more, 9, False), (1.0, 12, False)):
         found = build_workspace_map(
-            saved, predict_unknown, SMALL, lambda q, r=radius: np.full(len(q), r)
+            saved, predict_nan_radius, SMALL, lambda q, r=radius: np.full(len(q), r)
         )
         assert found.inside == (count, 12)
         assert found.to_dict()["held_out_inside"] == {"count": count, "of": 12}
@@ -231,12 +233,12 @@ def test_beyond_the_data_is_told_apart(saved):
     """What is reached has joint 1 on the side that was measured, and is told by its bins."""
     side = saved.data.q[:, 0] > 0.2
     half = replace(saved, data=saved.data.take(side), held=np.zeros(side.sum(), dtype=bool))
-    found = build_workspace_map(half, predict_unknown, replace(SMALL, samples=20_000))
+    found = build_workspace_map(half, predict_nan_radius, replace(SMALL, samples=20_000))
     vertical, horizontal = found.sections
     share = np.nansum(vertical.reached * vertical.count) / vertical.count.sum()
     assert share == pytest.approx(found.sampled.reached.mean())
     q = random_joint_values_above_floor(saved.cells["after"].robot, 500, np.random.default_rng(2))
-    assert not is_inside_training_poses(half.data.q, q[q[:, 0] < 0.2]).any()
+    assert not is_interpolated_by_training_poses(half.data.q, q[q[:, 0] < 0.2]).any()
     flat = np.abs(found.sampled.place[:, 2] - found.height) <= 0.5 * found.slab
     assert horizontal.count.sum() == flat.sum()
     assert any("J1 moved over" in notice for notice in found.notices)
@@ -250,7 +252,7 @@ def test_what_is_predicted_is_drawn(saved, tmp_path):
 
 
 def test_without_a_covariance_only_what_was_observed_is_drawn(saved, tmp_path):
-    found = build_workspace_map(saved, predict_unknown, SMALL)
+    found = build_workspace_map(saved, predict_nan_radius, SMALL)
     assert not found.predicted
     for name in ("seen", "again"):
         save_map(found, tmp_path / f"{name}.svg")
@@ -265,7 +267,7 @@ def test_the_line_parts_what_is_reached_from_what_is_not(saved):
     """Each edge of the line has a bin that the training poses reach on one side alone."""
     from matplotlib.figure import Figure
 
-    part = build_workspace_map(saved, predict_unknown, SMALL).sections[0]
+    part = build_workspace_map(saved, predict_nan_radius, SMALL).sections[0]
     axes = Figure().subplots()
     draw_training_region_outline(axes, part)
     (line,) = axes.collections

@@ -41,7 +41,7 @@ from minimax_cal.validation.tolerance import (
     describe_other_claim,
     judge_limit_by_claim,
     overall_verdict,
-    parse_limits,
+    parse_tolerance_limits,
 )
 
 # ---- tolerance -----------------------------------------------------------------------------------
@@ -139,12 +139,12 @@ def test_what_is_passed_does_not_hide_what_is_seen_beyond():
 
 
 def test_limits_are_read():
-    assert parse_limits("rms 0.2, max 0.5") == (
+    assert parse_tolerance_limits("rms 0.2, max 0.5") == (
         ToleranceLimit("rms", 0.2),
         ToleranceLimit("max", 0.5),
     )
-    assert parse_limits("MAX=1mm") == (ToleranceLimit("max", 1.0),)
-    assert parse_limits("") == ()
+    assert parse_tolerance_limits("MAX=1mm") == (ToleranceLimit("max", 1.0),)
+    assert parse_tolerance_limits("") == ()
     for text in (
         "0.2",
         "rms",
@@ -156,9 +156,9 @@ def test_limits_are_read():
         "rms inf",
     ):
         with pytest.raises(mc.OptionError, match="write it in mm as rms"):
-            parse_limits(text)
+            parse_tolerance_limits(text)
     with pytest.raises(mc.OptionError, match="twice"):
-        parse_limits("rms 0.2, rms 0.3")
+        parse_tolerance_limits("rms 0.2, rms 0.3")
 
 
 def test_the_upper_limits_of_beyond_are_in_the_file(robot):
@@ -189,7 +189,7 @@ def inner(
 
 def refitted(estimator: Estimator, state: ParameterValues) -> ParameterValues:
     """The least squares of an estimator, solved to the end by Levenberg and Marquardt."""
-    model = estimator.model.weight_targets(estimator.share)
+    model = estimator.model.with_target_weights(estimator.share)
     model = with_pose_errors(model, estimator.mix) if len(estimator.mix) else model
     points = float(model.pose_counts_by_target.sum())
     solved = least_squares.solve(PointLeastSquares(model), state.batch(), 1, points)
@@ -212,7 +212,7 @@ def test_replicates_are_true_refits(objective, options, robot, noisy, rng):
     active = one.identification.active
     sigma = one.uncertainty.sigma[active]
     for number in range(4):
-        rows = np.repeat(np.arange(data.poses), draws.row_counts(number))
+        rows = np.repeat(np.arange(data.poses), draws.draw_counts_of_rows(number))
         assert len(rows) == data.poses
         end = refitted(one.estimator.at_poses(rows), one.cell.parameter_values)
         off = parameter_step(one.cell.parameter_values, end)[active]
@@ -235,7 +235,7 @@ def test_replicates_of_a_robust_fit_give_way_as_it_does(robot, noisy):
     sigma = fit.uncertainty.sigma[found.place]
     ours, theirs = found.change / sigma, np.zeros(found.change.shape)
     for number in range(8):
-        rows = np.repeat(np.arange(data.poses), draws.row_counts(number))
+        rows = np.repeat(np.arange(data.poses), draws.draw_counts_of_rows(number))
         fresh = fit_cell(robot, data.take(rows), fit.options, silent_progress)
         theirs[number] = parameter_step(state, fresh.state)[found.place] / sigma
     assert (theirs * ours).sum() / (ours**2).sum() == pytest.approx(1.0, abs=0.15)
@@ -248,7 +248,7 @@ def test_replicates_of_a_minimax_are_minimax_fits(robot, noisy):
     change, good = refit_minimax_replicates(one, draws, silent_progress)
     assert good.all()
     for number in range(2):
-        rows = np.repeat(np.arange(noisy.data.poses), draws.row_counts(number))
+        rows = np.repeat(np.arange(noisy.data.poses), draws.draw_counts_of_rows(number))
         fresh = fit_cell(robot, noisy.data.take(rows), one.options, silent_progress)
         step = np.zeros(one.estimator.model.names.parameter_count)
         step[one.identification.active] = change[number]
@@ -282,15 +282,15 @@ def test_percentiles_lie_about_the_value(found, fit):
 def test_rows_of_a_pose_are_drawn_together(rng):
     group = np.array([4, 4, 9, 1, 9, 9])
     draws = draw_poses(group, 50, rng)
-    assert draws.times.shape == (50, 3)
-    assert np.all(draws.times.sum(axis=1) == 3)
+    assert draws.draw_counts.shape == (50, 3)
+    assert np.all(draws.draw_counts.sum(axis=1) == 3)
     for number in range(50):
-        rows = draws.row_counts(number)
+        rows = draws.draw_counts_of_rows(number)
         assert rows[0] == rows[1]
         assert rows[2] == rows[4] == rows[5]
-    assert abs(draw_poses(np.arange(40), 4000, rng).times.mean(axis=0) - 1.0).max() < 5 / np.sqrt(
-        4000
-    )
+    assert abs(
+        draw_poses(np.arange(40), 4000, rng).draw_counts.mean(axis=0) - 1.0
+    ).max() < 5 / np.sqrt(4000)
 
 
 def test_positions_are_those_of_the_replicates(robot, found, fit):
@@ -318,7 +318,7 @@ def test_poses_left_out_judge_a_replicate(robot, noisy, found, fit):
     train = fit.data.take(~fit.held)
     draws = draw_poses(group_repeated_poses(train), 120, np.random.default_rng(3))
     for number in (0, 60):
-        out = train.take(draws.row_counts(number) == 0)
+        out = train.take(draws.draw_counts_of_rows(number) == 0)
         rms = mc.evaluate(whole(robot, found, number), out).rms_mm
         assert 1e3 * found.out_of_bag[number] == pytest.approx(rms, rel=1e-3)
     interval = found.rms_interval()

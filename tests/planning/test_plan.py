@@ -104,7 +104,7 @@ NAMES = tuple(criteria(2))
 
 def test_sizes_are_what_they_say():
     f = 4
-    info = random_menu(1, 6, 3, f).sum_information(np.arange(6))
+    info = random_menu(1, 6, 3, f).information_of_experiments(np.arange(6))
     cov = np.linalg.inv(info)
     all_ = criteria(f)
     assert_allclose(
@@ -134,7 +134,7 @@ def test_sizes_are_what_they_say():
 
 @pytest.mark.parametrize("name", NAMES)
 def test_what_tells_not_everything_has_no_size(name):
-    info = random_menu(0, 1, 2, 3).sum_information(np.array([0]))
+    info = random_menu(0, 1, 2, 3).information_of_experiments(np.array([0]))
     assert evaluate_information_matrix(criteria(3)[name], info) == np.inf
 
 
@@ -142,7 +142,7 @@ def test_what_tells_not_everything_has_no_size(name):
 @pytest.mark.parametrize("r", [1, 3])
 def test_updates_are_those_of_a_new_inverse(name, r):
     menu, criterion = random_menu(3, 12, r, 5), criteria(5)[name]
-    info = menu.sum_information(np.arange(12))
+    info = menu.information_of_experiments(np.arange(12))
     found = criterion.evaluate_after_adding(np.linalg.inv(info), menu.sensitivities)
     direct = [evaluate_information_matrix(criterion, info + a.T @ a) for a in menu.sensitivities]
     assert_allclose(found, direct, rtol=ROUNDING)
@@ -151,7 +151,7 @@ def test_updates_are_those_of_a_new_inverse(name, r):
 @pytest.mark.parametrize("name", ["E", "G"])
 def test_updates_of_the_worst_are_bounds(name):
     menu, criterion = random_menu(3, 12, 2, 5), criteria(5)[name]
-    info = menu.sum_information(np.arange(12))
+    info = menu.information_of_experiments(np.arange(12))
     cov = np.linalg.inv(info)
     direct = np.array(
         [evaluate_information_matrix(criterion, info + a.T @ a) for a in menu.sensitivities]
@@ -169,7 +169,9 @@ def test_updates_of_the_worst_are_bounds(name):
 def test_no_information_has_a_size_below_the_polar(seed, name):
     f = 4
     criterion = criteria(f, seed)[name]
-    here, there = (random_menu(seed + i, 6, 2, f).sum_information(np.arange(6)) for i in (1, 2))
+    here, there = (
+        random_menu(seed + i, 6, 2, f).information_of_experiments(np.arange(6)) for i in (1, 2)
+    )
     cov = np.linalg.inv(here)
     pull = inverse_criterion_gradient(cov, criterion.equivalent_trace_weight(cov))
     assert evaluate_information_matrix(criterion, there) >= 1.0 / np.trace(pull @ there) * (
@@ -185,12 +187,14 @@ def test_no_information_has_a_size_below_the_polar(seed, name):
 def test_an_exchange_never_worsens(seed, name):
     menu, criterion = random_menu(seed, 14, 1, 4), criteria(4, seed)[name]
     start = np.random.default_rng(seed).choice(14, 6, replace=False)
-    before = evaluate_information_matrix(criterion, menu.sum_information(start))
+    before = evaluate_information_matrix(criterion, menu.information_of_experiments(start))
     found = improve_design_by_exchange(menu, criterion, start)
     assert found.criterion_value <= before
     assert_allclose(
         found.criterion_value,
-        evaluate_information_matrix(criterion, menu.sum_information(found.experiment_indices)),
+        evaluate_information_matrix(
+            criterion, menu.information_of_experiments(found.experiment_indices)
+        ),
         rtol=ROUNDING,
     )
     assert len(set(found.experiment_indices.tolist())) == 6
@@ -208,10 +212,14 @@ def test_small_menus_by_brute_force(name, seed, at_hand):
     menu, criterion = random_menu(seed, 11, 1, 3), criteria(3, seed)[name]
     if at_hand:
         menu = ExperimentPool(
-            menu.sensitivities, random_menu(seed + 9, 2, 1, 3).sum_information(np.arange(2))
+            menu.sensitivities,
+            random_menu(seed + 9, 2, 1, 3).information_of_experiments(np.arange(2)),
         )
     every = [np.array(one) for one in itertools.combinations(range(11), 5)]
-    best = min(evaluate_information_matrix(criterion, menu.sum_information(one)) for one in every)
+    best = min(
+        evaluate_information_matrix(criterion, menu.information_of_experiments(one))
+        for one in every
+    )
     found = search_best_design(menu, criterion, build_first_design(menu, criterion, 5, 0), silent)
     assert found.lower_bound <= best * (1 + ROUNDING)
     assert_allclose(found.design.criterion_value, best, rtol=ROUNDING)
@@ -242,7 +250,9 @@ def test_d_optimal_polynomials_are_the_known_ones(degree, support):
     assert_allclose(found.design.criterion_value, best, rtol=ROUNDING)
     assert_allclose(found.lower_bound, best, rtol=ROUNDING)
     # Kiefer and Wolfowitz: at the optimum the largest variance of a prediction is f / n
-    cov = invert_information_matrices(menu.sum_information(found.design.experiment_indices))
+    cov = invert_information_matrices(
+        menu.information_of_experiments(found.design.experiment_indices)
+    )
     variance = np.einsum("cri,ij,crj->c", menu.sensitivities, cov, menu.sensitivities)
     assert_allclose(variance.max() * count, degree + 1, rtol=ROUNDING)
     assert_allclose(
@@ -300,7 +310,7 @@ def test_worth_is_the_number_of_random_ones_that_tell_as_much():
     rng = np.random.default_rng(1)
     sizes = [
         evaluate_information_matrix(
-            criterion, menu.sum_information(rng.choice(4000, 75, replace=False))
+            criterion, menu.information_of_experiments(rng.choice(4000, 75, replace=False))
         )
         for _ in range(200)
     ]

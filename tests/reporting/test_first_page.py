@@ -30,7 +30,7 @@ from minimax_cal.reporting.html.first_page import (
 from minimax_cal.reporting.html.motion_report import build_motion_report, find_motion_diagnosis
 from minimax_cal.reporting.html.report_builder import ReportRequest
 from minimax_cal.reporting.html.report_sources import ReportSources
-from minimax_cal.validation.tolerance import NOT_PASSED, NOT_STATED, PASSED, parse_limits
+from minimax_cal.validation.tolerance import NOT_PASSED, NOT_STATED, PASSED, parse_tolerance_limits
 
 # ---- first page ----------------------------------------------------------------------------------
 
@@ -180,7 +180,7 @@ def test_too_few_poses_leave_a_maximum_open(robot, tmp_path):
     content = fit.to_dict()
     del content["accuracy"]["cv"], content["arrays"]["crossed"]
     mc.Fit.from_dict(content).save(tmp_path / "old.json")
-    wording = ReportRequest("2026-11-21", limits=parse_limits("max 5"))
+    wording = ReportRequest("2026-11-21", limits=parse_tolerance_limits("max 5"))
     text = rendered(wording, tmp_path / "old.json").text["verdict"]
     assert "Not stated" in text
     assert "9 poses are too few for a maximum: at least 19 are needed" in text
@@ -240,7 +240,9 @@ def between(fit: mc.Fit) -> str:
 
 
 def judged(fit: mc.Fit, limits: str, *deliver: str) -> ReportJudgement:
-    return judge_sources(read_report_sources([fit]), parse_limits(limits), "inside", None, deliver)
+    return judge_sources(
+        read_report_sources([fit]), parse_tolerance_limits(limits), "inside", None, deliver
+    )
 
 
 def test_a_file_is_judged_by_what_it_reaches(fit, between):
@@ -359,7 +361,7 @@ def test_outliers_that_were_kept_are_named(files):
 
 def test_with_room_enough_it_is_passed_with_them_too(files):
     found = judge_sources(
-        read_report_sources([files / "used.json"]), parse_limits("rms 2"), "inside", None
+        read_report_sources([files / "used.json"]), parse_tolerance_limits("rms 2"), "inside", None
     )
     assert (found.verdict_sentence, found.verdict) == (
         f"{PASSED} inside the measured region",
@@ -372,7 +374,7 @@ def test_with_room_enough_it_is_passed_with_them_too(files):
 
 def test_a_diagnosis_alone_says_it_as_well(files):
     found = judge_sources(
-        read_report_sources([files / "gap.json"]), parse_limits("rms 0.1"), "inside", None
+        read_report_sources([files / "gap.json"]), parse_tolerance_limits("rms 0.1"), "inside", None
     )
     assert found.verdict == PASSED
     assert found.verdict_sentence.startswith(
@@ -382,7 +384,7 @@ def test_a_diagnosis_alone_says_it_as_well(files):
 
 def test_without_any_the_page_says_so(files):
     sources = read_report_sources([files / "poses.json"])
-    found = judge_sources(sources, parse_limits("rms 2"), "inside", None)
+    found = judge_sources(sources, parse_tolerance_limits("rms 2"), "inside", None)
     assert (found.set_aside, found.judgements_with_set_aside) == ((), ())
     assert "No measured point was set aside." in html_page.render_html(
         build_report(sources, WORDING)

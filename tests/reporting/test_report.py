@@ -28,7 +28,7 @@ from plotly.offline import get_plotlyjs
 
 import minimax_cal as mc
 from minimax_cal.cli.report import report_command
-from minimax_cal.core.display_text import replace_control_characters
+from minimax_cal.core.display_text import replace_invisible_and_bidi_characters
 from minimax_cal.core.errors import CalibrationError, OptionError
 from minimax_cal.core.tables import Table
 from minimax_cal.modelling.effects.effect_names import format_budget_step, format_effect
@@ -506,7 +506,7 @@ def test_hostile_names_are_text(tmp_path, fit, gap):
     kinds = [attributes.get("type") for attributes, _ in seen.scripts]
     assert kinds.count("application/json") == len(kinds) - 2  # figures, plotly, the page's own
     assert kinds.count(None) == plain.tags.count("body") == 1
-    text = replace_control_characters(NASTY)
+    text = replace_invisible_and_bidi_characters(NASTY)
     for name in ("verdict", "provenance", "diagnosis-tables", "solution", "parameters"):
         assert text in seen.text[name]
     assert seen.tables["Files"][2][1] == text
@@ -555,10 +555,10 @@ def test_json_in_a_script_cannot_end_it(content):
 @given(st.text())
 @settings(max_examples=200)
 def test_what_is_shown_can_be_written_and_hides_nothing(text):
-    shown = replace_control_characters(text)
+    shown = replace_invisible_and_bidi_characters(text)
     shown.encode()  # no lone surrogates
     assert len(shown) == len(text)
-    assert replace_control_characters(shown) == shown
+    assert replace_invisible_and_bidi_characters(shown) == shown
     assert not set("\u202e\u2066\x00\x1b\n") & set(shown)
 
 

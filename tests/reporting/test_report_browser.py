@@ -14,12 +14,12 @@ from conftest import run
 from test_report import NASTY, WORDING, hostile, write
 
 from experiments.relative_gap import RelativeGapJob, draw_arm, simulate_instrument
-from minimax_cal.core.display_text import replace_control_characters
+from minimax_cal.core.display_text import replace_invisible_and_bidi_characters
 from minimax_cal.core.tables import Table
 from minimax_cal.diagnosing.diagnose_instruments import diagnose_relative
 from minimax_cal.reporting.html import build_report, read_report_sources, render_html
 from minimax_cal.reporting.html.report_content import ChartBlock
-from minimax_cal.validation.tolerance import parse_limits
+from minimax_cal.validation.tolerance import parse_tolerance_limits
 
 A4 = (680, 993)  # pixels between the margins
 PATIENCE = 120.0  # seconds; drawing by software on a busy machine is slow
@@ -236,7 +236,7 @@ def test_the_page_itself_forbids_scripts_and_requests(opened):
 @pytest.mark.dev
 def test_the_first_page_is_one_sheet_with_all_that_is_signed(driver, results, tmp_path):
     """On A4: robot, verdict, cause, results, picture and signatures, and nothing else."""
-    limits = parse_limits("rms 0.2, max 0.5")
+    limits = parse_tolerance_limits("rms 0.2, max 0.5")
     facts = {"serial_number": "26-104711", "tool": "three-ball nest, " * 4}
     wording = replace(WORDING, limits=limits, facts=facts)
     sources = read_report_sources([results / "fit.json", results / "gap.json"])
@@ -284,7 +284,7 @@ def test_hostile_names_are_shown_and_do_nothing(driver, folder):
         assert driver.switch_to.alert
     assert [e for e in driver.get_log("browser") if e["level"] == "SEVERE"] == []
     assert not [url for url in sent(driver)[1:] if not url.startswith(("data:", "blob:"))]
-    text = replace_control_characters(NASTY)
+    text = replace_invisible_and_bidi_characters(NASTY)
     assert text in driver.execute_script("return document.querySelector('h1').textContent")
     assert driver.execute_script("return document.images.length") == 0
     labels = driver.execute_script(

@@ -15,7 +15,7 @@ import minimax_cal as mc
 from minimax_cal.compensation.exporters.export_job import build_export_job
 from minimax_cal.compensation.robot_export import build_export, write_exported_files
 from minimax_cal.modelling.cell import build_measurements_at_rest
-from minimax_cal.simulators.mjcf import write
+from minimax_cal.simulators.mjcf import build_mjcf_file
 from minimax_cal.simulators.result import SimulatorGap
 from tests.conftest import run
 from tests.problems_mjcf import drive_alone, published_like, ur10_like
@@ -56,7 +56,7 @@ def test_a_new_file_holds_still_and_moves(name):
     cell = cell_with(robot, "joint_compliance:all", "encoder_gain:all", "base_flex:frame",
                      size=3e-6, base_flex=[2e-7],
                      encoder_gain=[2e-4] * int((~robot.prismatic).sum()))  # fmt: skip
-    text = write(build_export_job("cell", cell)).content.decode()
+    text = build_mjcf_file(build_export_job("cell", cell)).content.decode()
     check_held(text, cell, poses(robot, 4))
     model = mujoco.MjModel.from_xml_string(text)
     assert model.actuator_gainprm[:, 0].max() < LARGEST_GAIN
@@ -68,7 +68,7 @@ def test_one_compliant_joint_among_stiff_ones_has_a_spring():
     robot = with_masses(robot_called("irb2600"))
     cell = cell_with(robot, "joint_compliance:J2", "link_bending:L1", size=3e-6,
                      link_bending=[1e-6])  # fmt: skip
-    text = write(build_export_job("cell", cell)).content.decode()
+    text = build_mjcf_file(build_export_job("cell", cell)).content.decode()
     check_held(text, cell, poses(robot, 4))
     model = mujoco.MjModel.from_xml_string(text)
     assert model.jnt_stiffness[model.joint("flex2").id] == pytest.approx(1.0 / 3e-6, rel=0.3)
@@ -89,7 +89,7 @@ def test_a_new_file_stands_and_moves_in_a_default_scene(name):
     robot = robot_called(name)
     effects = [] if name == "ur10" else ["joint_compliance:J2", "encoder_gain:J1"]
     cell = cell_with(robot, *effects, size=1e-7)
-    text = write(build_export_job("cell", cell)).content.decode()
+    text = build_mjcf_file(build_export_job("cell", cell)).content.decode()
     model, q = in_default_scene(text), poses(robot, 3)
     assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
     assert model.opt.timestep == 0.002
@@ -105,10 +105,10 @@ def test_a_file_corrected_again_stays_braked_in_its_joints(tmp_path):
     robot = with_masses(robot_called("ur10"))
     cell = cell_with(robot, "joint_compliance:all", size=3e-6)
     path = tmp_path / "arm.xml"
-    path.write_bytes(write(build_export_job("cell", cell_with(robot))).content)
+    path.write_bytes(build_mjcf_file(build_export_job("cell", cell_with(robot))).content)
     job = replace(build_export_job("cell", cell), nominal=robot, fitted=True, model=path,
                   path=tmp_path / "out.xml")  # fmt: skip
-    text = write(job).content.decode()
+    text = build_mjcf_file(job).content.decode()
     model = mujoco.MjModel.from_xml_string(text)
     assert (model.actuator_biasprm[:, 2] == 0.0).all()
     check_held(text, cell, poses(robot, 3))
@@ -271,7 +271,7 @@ def test_a_scene_stays_and_the_arm_that_it_includes_is_beside_it(folder, tmp_pat
     for given, name in ((scene, "new_scene.xml"), (model, "new_arm.xml")):
         path = tmp_path / folder / name
         write_exported_files(
-            write(
+            build_mjcf_file(
                 replace(
                     build_export_job("cell", cell),
                     nominal=weighs,
@@ -309,7 +309,7 @@ def test_a_keyframe_grows_with_the_springs(tmp_path):
         model=model,
         path=tmp_path / "out.xml",
     )
-    out = mujoco.MjModel.from_xml_string(write(job).content.decode())
+    out = mujoco.MjModel.from_xml_string(build_mjcf_file(job).content.decode())
     assert out.nq == 9
     at = [int(out.joint(f"joint{i + 1}").qposadr[0]) for i in range(6)]
     assert out.key_qpos[0][at].tolist() == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
@@ -322,7 +322,7 @@ def test_a_command_map_reaches_what_the_fit_says(tmp_path):
     cell = cell_with(weighs, "joint_compliance:all", "gear_error:J3:turns=1", size=8e-6,
                      gear_error=[4e-4, -2e-4])  # fmt: skip
     job = replace(build_export_job("cell", cell), nominal=weighs, fitted=True, model=model)
-    made = write(replace(job, path=tmp_path / "out.xml"))
+    made = build_mjcf_file(replace(job, path=tmp_path / "out.xml"))
     (tmp_path / "out.xml").write_bytes(made.content)
     (tmp_path / "out.commands.json").write_bytes(made.beside[".commands.json"])
     q = poses(weighs, 4)

@@ -54,12 +54,12 @@ def bent_cell(robot: mc.Robot, texts: dict[str, list[float]]) -> mc.Cell:
 def corrected(path: Path, chain: ModelArm, cell: mc.Cell, out: Path) -> Any:
     from minimax_cal.compensation.exporters.export_job import build_export_job
     from minimax_cal.compensation.robot_export import write_exported_files
-    from minimax_cal.simulators.mjcf import write
+    from minimax_cal.simulators.mjcf import build_mjcf_file
 
     job = replace(
         build_export_job("cell", cell), nominal=chain.robot, fitted=True, model=path, path=out
     )
-    write_exported_files(write(job), out)
+    write_exported_files(build_mjcf_file(job), out)
     return mujoco.MjModel.from_xml_path(str(out))
 
 

@@ -22,7 +22,7 @@ from minimax_cal.robots.gravity_torques import assumed_link_masses_and_centres
 from minimax_cal.robots.robot import robot_from_dict
 from minimax_cal.simulators.arm import build_simulated_arm
 from minimax_cal.simulators.elements import find_axes_orthogonal_to_their_images
-from minimax_cal.simulators.mjcf import write
+from minimax_cal.simulators.mjcf import build_mjcf_file
 from tests.conftest import run
 
 mujoco = pytest.importorskip("mujoco", reason="needs mujoco: pip install minimax-cal[mujoco]")
@@ -80,7 +80,7 @@ def cell_with(robot: mc.Robot, *texts: str, size: float = 2e-6, **values: list[f
 
 
 def model_of(cell: Cell) -> Any:
-    text = write(build_export_job("cell", cell)).content.decode()
+    text = build_mjcf_file(build_export_job("cell", cell)).content.decode()
     return mujoco.MjModel.from_xml_string(text)
 
 
@@ -191,7 +191,7 @@ def test_a_gain_that_carries_a_deflection_says_so():
     """The compliance that is said is the law's: that of the gain under its share of gravity."""
     cell = cell_with(with_masses(robot_called("irb2600")), "joint_compliance:all")
     text, ((_, compliance),) = (
-        write(build_export_job("cell", cell)).content.decode(),
+        build_mjcf_file(build_export_job("cell", cell)).content.decode(),
         cell.effects.terms_with_values,
     )
     model = mujoco.MjModel.from_xml_string(text)
@@ -259,7 +259,7 @@ def test_what_changes_with_time_is_named():
     data = replace(data, columns={**data.columns, "clock": np.linspace(0.0, 1.0, data.poses)})
     drift = parse_effect_terms(cell.pose_arm(data), ["frame_drift:frame:constant=0.5"])
     cell = replace(cell, effects=Fitted(drift, (np.full(6, 1e-4),)))
-    made = write(build_export_job("cell", cell))
+    made = build_mjcf_file(build_export_job("cell", cell))
     assert any("frame drift" in text and "time" in text for text in made.notices)
     assert not made.beside
 

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 import minimax_cal as mc
 from minimax_cal.dynamics.known_inputs import MotionKnown, Payload, read_runs_of_robot
-from minimax_cal.dynamics.logs import format_runs_csv
+from minimax_cal.dynamics.logs import format_runs_csv_in_rad_and_mm
 from minimax_cal.dynamics.logs.log_table import NO_TORQUE_UNIT, Run
 from minimax_cal.dynamics.regressor import compute_link_inertial_parameters
 from tests.conftest import run
@@ -75,7 +75,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     logs = []
     for one in simulate_logs(arm, 3, 8.0):
         path = folder / f"{one.name}.csv"
-        path.write_text(format_runs_csv([one], np.zeros(3, dtype=bool)))
+        path.write_text(format_runs_csv_in_rad_and_mm([one], np.zeros(3, dtype=bool)))
         logs.append(path)
     out, text = folder / "corrected.xml", folder / "gap.json"
     figure = folder / "gap.png"

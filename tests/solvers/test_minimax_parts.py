@@ -17,10 +17,10 @@ from minimax_cal.solvers.epigraph_qp import (
     build_elastic_qp,
     build_epigraph_qp,
     does_step_lower_violation,
-    find_functions_above,
+    find_functions_above_epigraph_bound,
     ignore_warm_start,
+    next_penalties_or_none,
     solve_subproblem,
-    update_penalties,
 )
 from minimax_cal.solvers.iterate import Iterate, PointTerms
 from minimax_cal.solvers.line_search import search_along_step
@@ -214,13 +214,15 @@ def test_functions_that_were_forgotten_are_the_worst_beyond():
     here = linear([1.0, 0.0, 1.0, 1.0, 0.0, 0.0], slopes)
     answer = Solution(np.array([1.0, 1.0, 0.5]), np.zeros(1), QpStatus.SOLVED, 0.0)
     # f + f'd - max f - v of all: 0.5, -0.5, 2.5, -0.5, 0.5, 2.5; of equals the first comes first
-    assert set(find_functions_above(here, np.array([0]), answer).tolist()) == {2, 5}
-    assert_array_equal(find_functions_above(here, np.array([0, 2]), answer), [5, 4])
-    assert_array_equal(find_functions_above(here, np.array([0, 2, 5]), answer), [4])
-    assert not len(find_functions_above(here, np.array([4, 0, 2, 5]), answer))
-    assert not len(find_functions_above(here, np.arange(6), answer))
+    assert set(find_functions_above_epigraph_bound(here, np.array([0]), answer).tolist()) == {2, 5}
+    assert_array_equal(find_functions_above_epigraph_bound(here, np.array([0, 2]), answer), [5, 4])
+    assert_array_equal(find_functions_above_epigraph_bound(here, np.array([0, 2, 5]), answer), [4])
+    assert not len(find_functions_above_epigraph_bound(here, np.array([4, 0, 2, 5]), answer))
+    assert not len(find_functions_above_epigraph_bound(here, np.arange(6), answer))
     lost = replace(answer, status=QpStatus.FAILED)
-    assert_array_equal(find_functions_above(here, np.array([0, 2]), lost), [1, 3, 4, 5])
+    assert_array_equal(
+        find_functions_above_epigraph_bound(here, np.array([0, 2]), lost), [1, 3, 4, 5]
+    )
 
 
 def test_of_many_functions_the_largest_come_first():
@@ -346,7 +348,7 @@ def test_idle_is_who_falls_neither_in_value_nor_in_residual():
     """f is 1 with the slope 2, which is all of it over the length 1/2: the residual is 1."""
     at = replace(begun(parabola(), 1.0), least_residual=10.0, least_value=5.0, stalled_count=4)
     one, none = plan([0.0], [1.0]), np.zeros(0)
-    fell = at.with_multipliers(one.mu, one.lam, none, one.exact)
+    fell = at.update_after_qp(one.mu, one.lam, none, one.exact)
     assert (fell.least_residual, fell.least_value, fell.stalled_count, fell.qp_count) == (
         1.0,
         1.0,
@@ -354,7 +356,7 @@ def test_idle_is_who_falls_neither_in_value_nor_in_residual():
         1,
     )
     assert fell.kkt.residual == 1.0
-    still = fell.with_multipliers(one.mu, one.lam, none, one.exact)
+    still = fell.update_after_qp(one.mu, one.lam, none, one.exact)
     assert (still.least_residual, still.least_value, still.stalled_count, still.qp_count) == (
         1.0,
         1.0,
@@ -363,17 +365,17 @@ def test_idle_is_who_falls_neither_in_value_nor_in_residual():
     )
     assert (
         replace(at, least_residual=1.05, least_value=1.0)
-        .with_multipliers(one.mu, one.lam, none, one.exact)
+        .update_after_qp(one.mu, one.lam, none, one.exact)
         .stalled_count
         == 5
     )  # less than a tenth
     assert (
         replace(at, least_residual=1.15, least_value=1.0)
-        .with_multipliers(one.mu, one.lam, none, one.exact)
+        .update_after_qp(one.mu, one.lam, none, one.exact)
         .stalled_count
         == 0
     )
-    value = replace(at, least_residual=0.5, least_value=1.0 + 1e-6).with_multipliers(
+    value = replace(at, least_residual=0.5, least_value=1.0 + 1e-6).update_after_qp(
         one.mu, one.lam, none, one.exact
     )
     assert (value.least_residual, value.stalled_count) == (0.5, 0)
@@ -424,7 +426,7 @@ def test_damping_grows_and_falls_tenfold():
     there = at.problem.linearise(np.array([0.25]))
     for before, after in ((2.0, 0.2), (2e-6, 2e-7), (1e-6, 0.0), (0.0, 0.0)):
         move = np.array([-0.75])
-        moved = replace(at, damping=before).move_to(move, np.array([0.25]), there)
+        moved = replace(at, damping=before).after_step(move, np.array([0.25]), there)
         assert_allclose(moved.damping, after, rtol=1e-12)
     assert_allclose(moved.displacement, -0.75)
     assert_allclose(moved.kkt.stationarity, 0.5 * 0.75 / 0.25**2)  # slope by way over value
@@ -447,7 +449,7 @@ def test_the_price_of_a_violation(relaxed, d, penalty, expected):
     here = linear([0.0], [[-3.0]], [2.0], [[1.0]])
     at = standing(here, np.ones(1), np.array([-INF]), np.array([1.0]))
     one = plan([d], [1.0], [-2.0], elastic_penalties=np.array([5.0]) if relaxed else None)
-    found = update_penalties(replace(at, penalties=np.array([penalty])), one, 1e-8)
+    found = next_penalties_or_none(replace(at, penalties=np.array([penalty])), one, 1e-8)
     assert (None if found is None else found[0]) == pytest.approx(expected)
 
 

@@ -9,7 +9,7 @@ from scipy.optimize import Bounds, LinearConstraint, NonlinearConstraint, linpro
 from scipy.sparse import csr_array
 
 import minimax_cal as mc
-from minimax_cal.solvers.answer_check import find_descent_from_stationary_point
+from minimax_cal.solvers.answer_check import find_better_point_near_stationary_point
 from minimax_cal.solvers.derivatives import (
     CountedFunction,
     complex_step_jacobian,
@@ -349,9 +349,9 @@ def test_central_differences_are_of_second_order():
     def fun(z: np.ndarray) -> np.ndarray:
         return np.array([np.exp(z[0]), np.log(z[1])])
 
-    found = difference_jacobian(fun, x, length, central=True)
+    found = difference_jacobian(fun, x, length, is_central=True)
     assert_allclose(found, slopes, rtol=1e-9, atol=1e-10)
-    found = difference_jacobian(fun, x, length, central=False)
+    found = difference_jacobian(fun, x, length, is_central=False)
     assert_allclose(found, slopes, rtol=1e-7, atol=1e-7)
 
 
@@ -386,10 +386,10 @@ def test_the_way_down_from_a_flat_point_is_the_steepest(unit):
     def steeper(x: np.ndarray) -> np.ndarray:
         return top(x) - np.array([1e4 * (x[1] / unit) ** 3, 0.0])
 
-    down = find_descent_from_stationary_point(describe(top, nowhere), nowhere)
+    down = find_better_point_near_stationary_point(describe(top, nowhere), nowhere)
     assert_allclose(down, [0.0, 1e-3 * np.sqrt(1.0 / 6.0) * unit], rtol=1e-2)
     only = Bounds([-unit, -unit], [unit, 0.0])
-    other = find_descent_from_stationary_point(describe(steeper, nowhere, only), nowhere)
+    other = find_better_point_near_stationary_point(describe(steeper, nowhere, only), nowhere)
     assert_allclose(
         other, [1e-3 * np.sqrt(1.0 / 2.0) * unit, 0.0], rtol=1e-2
     )  # the cubic is against it there
@@ -398,7 +398,7 @@ def test_the_way_down_from_a_flat_point_is_the_steepest(unit):
         lambda x: np.array([1.0 + x[0] ** 2 + x[1] ** 2]),
         lambda x: np.array([1.0 + x[0]]),  # a slope: the search itself goes down
     ):
-        assert find_descent_from_stationary_point(describe(flat, nowhere), nowhere) is None
+        assert find_better_point_near_stationary_point(describe(flat, nowhere), nowhere) is None
 
 
 def two(x):

@@ -61,8 +61,8 @@ EXPORTERS: dict[str, Exporter] = {
     "json": Exporter(robot_json.build_robot_json, couples=True),
     "moc": Exporter(moc.build_moc_file, moc.list_written_compliance_effects),
     "mjcf": Exporter(
-        import_function_on_call(MJCF_EXPORTER_MODULE, "write"),
-        import_function_on_call(MJCF_EXPORTER_MODULE, "carries"),
+        import_function_on_call(MJCF_EXPORTER_MODULE, "build_mjcf_file"),
+        import_function_on_call(MJCF_EXPORTER_MODULE, "list_effects_held_by_mjcf"),
         simulated=True,
     ),
 }

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from minimax_cal.core.arrays import Array
-from minimax_cal.core.files import NotSavedResultError, read_saved_json
+from minimax_cal.core.files import NotSavedResultError, read_saved_result_json
 from minimax_cal.fitting.opened_results import OpenedResult, ResultOrFile, open_result
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell, build_measurements_at_rest
@@ -89,7 +89,7 @@ def open_export_source(
     path = Path(source)
     if path.suffix.lower() == ".json" and path.is_file():
         with suppress(NotSavedResultError):  # load_robot says what is wrong with it
-            if {"targets_mm", "kind"} & set(read_saved_json(path)):
+            if {"targets_mm", "kind"} & set(read_saved_result_json(path)):
                 return open_result(path, step_number)
     robot = load_robot(source)
     notices = load_urdf(source).notices if is_urdf_or_mjcf_source(source) else ()

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -102,7 +103,14 @@ def link_frames_at_zero(robot: Robot, base: Array) -> list[Array]:
     return out
 
 
-def match_robot_to_urdf(nominal: Robot, urdf_robot: UrdfRobot) -> tuple[Array, float]:
+class UrdfMatch(NamedTuple):
+    """Frame 0 of a robot in the URDF's root link (4, 4), and how far the arms differ [m]."""
+
+    base: Array
+    misfit: float
+
+
+def match_robot_to_urdf(nominal: Robot, urdf_robot: UrdfRobot) -> UrdfMatch:
     """Frame 0 of the nominal robot in the URDF's root link, and how well the arms agree [m].
 
     Each joint alone, and random poses: what they do to space must be the same up to one constant
@@ -141,7 +149,7 @@ def match_robot_to_urdf(nominal: Robot, urdf_robot: UrdfRobot) -> tuple[Array, f
             f"{1e3 * gap.max():.3g} mm or mrad, most at joint {worst + 1} ({moving[worst].name}): "
             "another robot, another zero position or another sense of a joint?"
         )
-    return base, float(gap.max())
+    return UrdfMatch(base, float(gap.max()))
 
 
 def pose_difference(first_pose: Array, second_pose: Array) -> float:
@@ -201,7 +209,14 @@ def replace_urdf_origins(
     return apply_byte_edits(urdf.raw, edits)
 
 
-def format_urdf_origin(pose: Array, previous_rpy: Array) -> tuple[str, str]:
+class UrdfOrigin(NamedTuple):
+    """The attributes of an origin."""
+
+    xyz: str
+    rpy: str
+
+
+def format_urdf_origin(pose: Array, previous_rpy: Array) -> UrdfOrigin:
     """xyz and rpy of an origin, the rpy near those that stood there.
 
     A rotation that stayed keeps its numbers, as far as a rounding error goes.
@@ -210,8 +225,9 @@ def format_urdf_origin(pose: Array, previous_rpy: Array) -> tuple[str, str]:
         np.abs(transform_from_xyz_rpy(np.zeros(3), previous_rpy)[:3, :3] - pose[:3, :3]).max()
         <= MAX_EQUAL_TRANSFORM_DIFFERENCE
     )
-    return format_number_triple(pose[:3, 3]), format_number_triple(
-        previous_rpy if same else pose_to_rpy(pose, previous_rpy)
+    return UrdfOrigin(
+        format_number_triple(pose[:3, 3]),
+        format_number_triple(previous_rpy if same else pose_to_rpy(pose, previous_rpy)),
     )
 
 

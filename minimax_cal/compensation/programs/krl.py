@@ -12,19 +12,24 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from minimax_cal.compensation.programs.program_text import (
+    FrameUse,
+    NamedLine,
+    NumberEdit,
     NumberInText,
     ProgramPoint,
     ProgramText,
+    RuntimeChange,
     check_coordinate_range,
     transform_from_position_mm,
 )
 from minimax_cal.core.arrays import Array
-from minimax_cal.core.display_text import blank_matches
+from minimax_cal.core.display_text import replace_matches_with_spaces
 from minimax_cal.core.errors import DataError
 from minimax_cal.measuring.importers.robot_programs import KRL_IGNORED_PATTERN
 
@@ -80,9 +85,7 @@ def find_motion_targets(program: ProgramText) -> MotionTargets:
     return MotionTargets(lines, *map(frozenset, (to, relative, to | relative | summed)))
 
 
-def find_used_frames(
-    program: ProgramText, points: Sequence[ProgramPoint]
-) -> Iterator[tuple[int, str, str]]:
+def find_used_frames(program: ProgramText, points: Sequence[ProgramPoint]) -> Iterator[FrameUse]:
     """Line, "tool" or "wobj", and its name wherever the file says one.
 
     FDAT of points in joints (FP1 of XP1) tell nothing of other points.
@@ -98,7 +101,7 @@ def find_used_frames(
             if before and f"X{before[1].upper()}" in joints:
                 continue
             kind = "tool" if found[1].upper() == "TOOL" else "wobj"
-            yield (
+            yield FrameUse(
                 program.line_number(found.start()),
                 kind,
                 normalise_frame_name(found[1].upper(), found[2]),
@@ -149,7 +152,7 @@ MIN_COSINE_B = 1e-7  # cosine of B below which A and C turn about one axis
 
 def parse_program(text: str, source: str) -> ProgramText:
     """A program or its data list."""
-    return ProgramText(text, blank_matches(text, KRL_IGNORED_PATTERN), source)
+    return ProgramText(text, replace_matches_with_spaces(text, KRL_IGNORED_PATTERN), source)
 
 
 def find_points(program: ProgramText) -> Iterator[ProgramPoint]:
@@ -169,27 +172,37 @@ def find_unchanged_point_lines(program: ProgramText) -> Iterator[int]:
             yield program.line_number(found.start())
 
 
-def find_displacements(program: ProgramText) -> Iterator[tuple[int, str]]:
+def find_displacements(program: ProgramText) -> Iterator[NamedLine]:
     """Lines and names of what displaces every point after it: a base does, which is heeded."""
     yield from ()
 
 
-def find_values_changed_at_runtime(program: ProgramText) -> Iterator[tuple[int, str, str, str]]:
+def find_values_changed_at_runtime(program: ProgramText) -> Iterator[RuntimeChange]:
     """What the run writes: line, "point", the point's name, and what of it.
 
     Changes of $TOOL and $BASE are heeded as those that a program moves with.
     """
     names = {name.upper() for kind, name, _ in find_point_values(program) if kind} | set(
-        find_declared_types(program)
+        find_types_of_unset_points(program)
     )
     for found in KRL_COMPONENT_ASSIGNMENT_PATTERN.finditer(program.text_without_comments):
         if found[1].upper() in names:
-            yield program.line_number(found.start(1)), "point", found[1], found[1] + found[2]
+            yield RuntimeChange(
+                program.line_number(found.start(1)), "point", found[1], found[1] + found[2]
+            )
 
 
-def find_point_values(program: ProgramText) -> Iterator[tuple[str, str, re.Match[str]]]:
+class PointValue(NamedTuple):
+    """A value of a point; no type where the point stays as it is."""
+
+    type_name: str
+    point_name: str
+    match: re.Match[str]
+
+
+def find_point_values(program: ProgramText) -> Iterator[PointValue]:
     """Type, name and braces of what a motion may go to; no type where it stays as it is."""
-    going, kinds = find_motion_targets(program), find_declared_types(program)
+    going, kinds = find_motion_targets(program), find_types_of_unset_points(program)
     for found in KRL_AGGREGATE_PATTERN.finditer(program.text_without_comments):
         line_start = program.text_without_comments.rfind("\n", 0, found.start()) + 1
         before = KRL_ASSIGNMENT_PATTERN.search(
@@ -217,9 +230,9 @@ def find_point_values(program: ProgramText) -> Iterator[tuple[str, str, re.Match
             and not relative
             and not is_term_of_frame_sum(program.text_without_comments, found)
         ):
-            yield kind, own, found
+            yield PointValue(kind, own, found)
         elif meant or name in going.all_names:
-            yield "", own, found
+            yield PointValue("", own, found)
 
 
 def is_term_of_frame_sum(bare_text: str, value_match: re.Match[str]) -> bool:
@@ -230,7 +243,7 @@ def is_term_of_frame_sum(bare_text: str, value_match: re.Match[str]) -> bool:
     return before.endswith(":") or bool(KRL_COLON_PATTERN.match(bare_text, value_match.end()))
 
 
-def find_declared_types(program: ProgramText) -> dict[str, str]:
+def find_types_of_unset_points(program: ProgramText) -> dict[str, str]:
     """Types of points that are declared without a value, by name."""
     return {
         name[1].upper(): found[1].upper()
@@ -312,11 +325,11 @@ def has_programmed_configuration(point: ProgramPoint, q: Array) -> bool:
 
 def list_configuration_changes(
     point: ProgramPoint, q_before: Array, q_after: Array
-) -> list[tuple[NumberInText, str]]:
+) -> list[NumberEdit]:
     """T, where a correction changed the sign of a joint."""
     now = negative_joint_bits(q_after)
     return [
-        (number, str((int(number.value) & ~63) | now))
+        NumberEdit(number, str((int(number.value) & ~63) | now))
         for number in point.configuration_numbers
         if int(number.value) & 63 == negative_joint_bits(q_before)
         and negative_joint_bits(q_before) != now

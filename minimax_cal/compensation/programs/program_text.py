@@ -8,6 +8,7 @@ from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -32,6 +33,37 @@ class NumberInText:
     value: float
     start: int
     stop: int
+
+
+class NumberEdit(NamedTuple):
+    """A number of a program, and the text that is written in its place."""
+
+    number: NumberInText
+    new_text: str
+
+
+class NamedLine(NamedTuple):
+    """A line of a program, and a name that stands there."""
+
+    line: int
+    name: str
+
+
+class FrameUse(NamedTuple):
+    """A line that uses a frame: "tool" or "wobj", and its name, '' where the line has none."""
+
+    line: int
+    frame_kind: str
+    name: str
+
+
+class RuntimeChange(NamedTuple):
+    """A line that writes to a "point", "tool" or "wobj" at run time, and the part it writes."""
+
+    line: int
+    kind: str
+    name: str
+    written_part: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +124,7 @@ class ProgramText:
             at += len(part) + 1
         return out
 
-    def replace_numbers(self, replacements: Sequence[tuple[NumberInText, str]]) -> str:
+    def replace_numbers(self, replacements: Sequence[NumberEdit]) -> str:
         """The text with numbers written anew; all else as it is."""
         parts, at = [], 0
         for number, new in sorted(replacements, key=lambda change: change[0].start):
@@ -103,14 +135,14 @@ class ProgramText:
 
 def build_correction_mark(
     program: ProgramText, head_pattern: re.Pattern[str], comment_sign: str
-) -> tuple[NumberInText, str]:
+) -> NumberEdit:
     """A comment that tells a corrected program, on a line of its own behind its head."""
     found = head_pattern.search(program.text_without_comments)
     at = found.end() if found else 0
     end = "\r\n" if "\r\n" in program.text else "\n"
     alone = program.text[at : at + 1] in ("", "\r", "\n")
     parts = (end if at else "", f"{comment_sign} {CORRECTION_MARK}", "" if at and alone else end)
-    return NumberInText(0.0, at, at), "".join(parts)
+    return NumberEdit(NumberInText(0.0, at, at), "".join(parts))
 
 
 def check_not_corrected_already(program: ProgramText) -> None:

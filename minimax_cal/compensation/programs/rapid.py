@@ -14,20 +14,24 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from minimax_cal.compensation.programs.program_text import (
-    NumberInText,
+    FrameUse,
+    NamedLine,
+    NumberEdit,
     ProgramPoint,
     ProgramText,
+    RuntimeChange,
     check_coordinate_range,
     rotation_from_quaternion,
     transform_from_position_mm,
 )
 from minimax_cal.core.arrays import Array
-from minimax_cal.core.display_text import blank_matches
+from minimax_cal.core.display_text import replace_matches_with_spaces
 from minimax_cal.core.errors import DataError
 from minimax_cal.measuring.importers.robot_programs import RAPID_IGNORED_PATTERN
 
@@ -134,13 +138,20 @@ def find_move_instructions(program: ProgramText) -> Iterator[MoveInstruction]:
         yield MoveInstruction(found[1], start, (found.end(), stop), tool, work)
 
 
-def find_displacement_instructions(program: ProgramText) -> Iterator[tuple[int, str]]:
+def find_displacement_instructions(program: ProgramText) -> Iterator[NamedLine]:
     """Lines and names of instructions that displace every point after them."""
     for found in RAPID_DISPLACEMENT_PATTERN.finditer(program.text_without_comments):
-        yield program.line_number(found.start(1)), found[1]
+        yield NamedLine(program.line_number(found.start(1)), found[1])
 
 
-def split_arguments(arguments_text: str) -> Iterator[tuple[str, str]]:
+class InstructionArgument(NamedTuple):
+    """An argument, and the comma or backslash before it."""
+
+    separator: str
+    text: str
+
+
+def split_arguments(arguments_text: str) -> Iterator[InstructionArgument]:
     """The arguments, each with the comma or the backslash before it."""
     depth, sign, at = 0, ",", 0
     for found in RAPID_SIGN_PATTERN.finditer(arguments_text):
@@ -149,9 +160,9 @@ def split_arguments(arguments_text: str) -> Iterator[tuple[str, str]]:
         elif found[0] in "])}":
             depth -= 1
         elif depth == 0:
-            yield sign, arguments_text[at : found.start()].strip()
+            yield InstructionArgument(sign, arguments_text[at : found.start()].strip())
             sign, at = found[0], found.end()
-    yield sign, arguments_text[at:].strip()
+    yield InstructionArgument(sign, arguments_text[at:].strip())
 
 
 def has_robtarget_argument(arguments_text: str, robtarget_names: set[str]) -> bool:
@@ -165,13 +176,20 @@ def has_robtarget_argument(arguments_text: str, robtarget_names: set[str]) -> bo
     return False
 
 
+class FrameNames(NamedTuple):
+    """Names of a tool and a work object, '' where none is told."""
+
+    tool: str
+    work_object: str
+
+
 def parse_tool_and_work_object(
     instruction_name: str,
     arguments_text: str,
     tool_names: set[str],
     *,
     is_controller_instruction: bool,
-) -> tuple[str, str]:
+) -> FrameNames:
     """Tool and work object of an instruction, '' where it does not tell.
 
     tool_names: names that the module declares.  is_controller_instruction: whether the instruction
@@ -180,21 +198,20 @@ def parse_tool_and_work_object(
     placed: list[str] = []
     for sign, text in split_arguments(arguments_text):
         if sign == "\\" and (work := RAPID_WORK_OBJECT_PATTERN.match(text)):
-            return (parse_datum_name(placed[-1]) if placed else ""), parse_datum_name(
-                text[work.end() :]
-            )
+            tool = parse_datum_name(placed[-1]) if placed else ""
+            return FrameNames(tool, parse_datum_name(text[work.end() :]))
         if sign == "," and text:
             placed.append(text)
     own = [text for text in placed if text.partition("{")[0].strip().lower() in tool_names]
     if own:
-        return parse_datum_name(own[-1]), "wobj0"
+        return FrameNames(parse_datum_name(own[-1]), "wobj0")
     if not is_controller_instruction:
-        return "", ""
+        return FrameNames("", "")
     ends = instruction_name.lower().startswith("move") and instruction_name.lower().endswith(
         RAPID_ENDINGS_WITH_TOOL_BEFORE_LAST
     )
     at = (4 if instruction_name[4:5].lower() == "c" else 3) if ends else len(placed) - 1
-    return (parse_datum_name(placed[at]) if 0 <= at < len(placed) else ""), "wobj0"
+    return FrameNames((parse_datum_name(placed[at]) if 0 <= at < len(placed) else ""), "wobj0")
 
 
 def parse_datum_name(text: str) -> str:
@@ -249,7 +266,7 @@ RAPID_LETTERS_SEARCHED_BEFORE_NAME = (
 
 def parse_program(text: str, source: str) -> ProgramText:
     """A module."""
-    return ProgramText(text, blank_matches(text, RAPID_IGNORED_PATTERN), source)
+    return ProgramText(text, replace_matches_with_spaces(text, RAPID_IGNORED_PATTERN), source)
 
 
 def find_points(program: ProgramText) -> Iterator[ProgramPoint]:
@@ -295,12 +312,12 @@ def find_unchanged_point_lines(program: ProgramText) -> Iterator[int]:
     yield from ()
 
 
-def find_displacements(program: ProgramText) -> Iterator[tuple[int, str]]:
+def find_displacements(program: ProgramText) -> Iterator[NamedLine]:
     """Lines and names of what displaces every point after it."""
     return find_displacement_instructions(program)
 
 
-def find_values_changed_at_runtime(program: ProgramText) -> Iterator[tuple[int, str, str, str]]:
+def find_values_changed_at_runtime(program: ProgramText) -> Iterator[RuntimeChange]:
     """What the run writes: line, "point", "tool" or "wobj", the datum's name, and what of it.
 
     A point that is written whole is not among them: its numbers stand there, or are made of points.
@@ -319,17 +336,24 @@ def find_values_changed_at_runtime(program: ProgramText) -> Iterator[tuple[int, 
         ):
             continue  # its declaration
         if kind in ("tool", "wobj") or (kind == "point" and "." in part):
-            yield program.line_number(found.start(1)), kind, name, name + part
+            yield RuntimeChange(program.line_number(found.start(1)), kind, name, name + part)
 
 
-def find_value_spans(program: ProgramText, start_offset: int) -> Iterator[tuple[int, int]]:
+class TextSpan(NamedTuple):
+    """Where a text stands in another."""
+
+    start: int
+    end: int
+
+
+def find_value_spans(program: ProgramText, start_offset: int) -> Iterator[TextSpan]:
     """Where the value of a declaration stands, or those of an array."""
     end = program.text_without_comments.find(";", start_offset)
     stop = len(program.text_without_comments) if end < 0 else end
     for literal in RAPID_LITERAL_PATTERN.finditer(
         program.text_without_comments, start_offset, stop
     ):
-        yield literal.span()
+        yield TextSpan(*literal.span())
 
 
 def count_values_in_brackets(literal: str) -> tuple[int, ...]:
@@ -394,10 +418,10 @@ def has_programmed_configuration(point: ProgramPoint, q: Array) -> bool:
 
 def list_configuration_changes(
     point: ProgramPoint, q_before: Array, q_after: Array
-) -> list[tuple[NumberInText, str]]:
+) -> list[NumberEdit]:
     """The quarter turns that a correction changed."""
     return [
-        (number, str(quarter_turn(q_after[joint])))
+        NumberEdit(number, str(quarter_turn(q_after[joint])))
         for joint, number in zip(QUARTER_TURN_JOINTS, point.configuration_numbers, strict=True)
         if quarter_turn(q_before[joint]) == number.value
         and quarter_turn(q_after[joint]) != number.value
@@ -444,11 +468,9 @@ def parse_frame_literal(
     return transform_from_position_mm(xyz, rotation_from_quaternion(quaternion, where))
 
 
-def find_used_frames(
-    program: ProgramText, points: Sequence[ProgramPoint]
-) -> Iterator[tuple[int, str, str]]:
+def find_used_frames(program: ProgramText, points: Sequence[ProgramPoint]) -> Iterator[FrameUse]:
     """Line, "tool" or "wobj", and its name of each move, '' where the move does not tell."""
     for move in find_move_instructions(program):
         if not move.goes_to_joints:
-            yield program.line_number(move.start), "tool", move.tool
-            yield program.line_number(move.start), "wobj", move.work_object
+            yield FrameUse(program.line_number(move.start), "tool", move.tool)
+            yield FrameUse(program.line_number(move.start), "wobj", move.work_object)

@@ -10,12 +10,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
+from typing import NamedTuple
 
 import numpy as np
 
 from minimax_cal.compensation.joint_compensation import Compensation
 from minimax_cal.compensation.programs import krl, rapid
 from minimax_cal.compensation.programs.program_text import (
+    NamedLine,
+    NumberEdit,
     ProgramPoint,
     ProgramText,
     build_correction_mark,
@@ -40,7 +43,7 @@ FRAME_KIND_NAMES = {"tool": "tool", "wobj": "work object"}
 
 def list_frame_uses_by_kind(
     language: ModuleType, program_text: ProgramText, points: Sequence[ProgramPoint]
-) -> dict[str, list[tuple[int, str]]]:
+) -> dict[str, list[NamedLine]]:
     """By "tool" and "wobj": each line that moves with one, and its name, '' where untold.
 
     None where all points are joints, which ask for no tool.
@@ -49,7 +52,7 @@ def list_frame_uses_by_kind(
         return {}
     told = sorted(language.find_used_frames(program_text, points))
     return {
-        one: [(line, name) for line, option, name in told if option == one]
+        one: [NamedLine(line, name) for line, option, name in told if option == one]
         for one in FRAME_KIND_NAMES
     }
 
@@ -196,7 +199,7 @@ class RobotProgram:
             else:
                 new = self.language.format_pose_numbers(pose, point)
                 changes += self.language.list_configuration_changes(point, old, q)
-            changes += zip(point.pose_or_joint_numbers, new, strict=True)
+            changes += map(NumberEdit, point.pose_or_joint_numbers, new)
         return self.text.replace_numbers(changes).encode("latin-1")
 
 
@@ -323,6 +326,13 @@ def warn_of_unchanged_points(language: ModuleType, program_text: ProgramText) ->
     )
 
 
+class ProgramJoints(NamedTuple):
+    """Joint values (m, n) of the points of a program, and notices."""
+
+    q: Array
+    notices: tuple[str, ...]
+
+
 def solve_program_joints(
     points: tuple[ProgramPoint, ...],
     language: ModuleType,
@@ -330,7 +340,7 @@ def solve_program_joints(
     tool: Array,
     work_object: Array,
     source: str,
-) -> tuple[Array, tuple[str, ...]]:
+) -> ProgramJoints:
     """(m, n) joints that the controller turns points into, and notices.  Raises DataError."""
     posed_points = [point for point in points if point.pose is not None]
     goals = [work_object @ point.pose @ np.linalg.inv(tool) for point in posed_points]
@@ -356,13 +366,13 @@ def solve_program_joints(
             before = several[np.argmin(np.abs(several - before).max(axis=1))]
         out.append(before)
     if not doubtful:
-        return np.array(out), ()
+        return ProgramJoints(np.array(out), ())
     said = (
         f"{source}: at line {format_first_items(doubtful)} no way "
         f"of {robot.name} stands as the configuration "
         "says; the one nearest to the point before is taken"
     )
-    return np.array(out), (said,)
+    return ProgramJoints(np.array(out), (said,))
 
 
 def solve_joint_configurations(robot: Robot, flange_poses: Array) -> Iterator[Array]:

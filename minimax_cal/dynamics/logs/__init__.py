@@ -32,7 +32,14 @@ from minimax_cal.measuring.importers import parse_unit_options
 from minimax_cal.reading.column_words import sort_joint_names_along_arm
 from minimax_cal.reading.log_formats import is_log_header
 
-__all__ = ["LogFiles", "Run", "are_logs", "format_runs_csv", "read_log_files", "read_runs"]
+__all__ = [
+    "LogFiles",
+    "Run",
+    "are_logs",
+    "format_runs_csv_in_rad_and_mm",
+    "read_log_files",
+    "read_runs",
+]
 
 LOG_DETECTION_LINE_COUNT = 50  # lines that show whether a file is a log
 
@@ -79,7 +86,7 @@ class LogFiles:
 
     def format_csv(self) -> str:
         """As CSV of this project."""
-        return format_runs_csv(self.runs, self.is_prismatic)
+        return format_runs_csv_in_rad_and_mm(self.runs, self.is_prismatic)
 
 
 def read_runs(
@@ -150,7 +157,7 @@ def read_log_files(
             raise DataError(f"{source}: holds {what}, unlike {other}; log the same of all runs")
     check_no_repeated_runs([draft for draft in drafts if draft.has_torques])
     return LogFiles(
-        runs=tuple(draft.build_run() for draft in drafts),
+        runs=tuple(draft.build_run_of_one_payload() for draft in drafts),
         format_names=tuple(draft.log.format_name for draft in drafts),
         columns=tuple(
             (*d.log.column_names_by_kind["q"], *d.log.column_names_by_kind[d.torque_kind])
@@ -218,7 +225,7 @@ def are_logs(paths: Sequence[Path | str]) -> bool:
     return True
 
 
-def format_runs_csv(runs: Sequence[Run], is_prismatic: Array) -> str:
+def format_runs_csv_in_rad_and_mm(runs: Sequence[Run], is_prismatic: Array) -> str:
     """CSV of runs of one arm that `read_runs` reads.  is_prismatic: (n,) joints in mm.
 
     Raises DataError for runs in different units.

@@ -170,7 +170,7 @@ def check_angle_units(draft: DraftRun) -> DraftRun:
     return draft
 
 
-def unwrap_angles(draft: DraftRun) -> DraftRun:
+def unwrap_angles_or_refuse_jumps(draft: DraftRun) -> DraftRun:
     """Angles without jumps by whole turns; jumps by less than a turn are none of an arm."""
     q = draft.q.copy()
     step = np.diff(draft.time)
@@ -203,7 +203,7 @@ def find_moving_joints(draft: DraftRun) -> Array:
     return np.asarray(np.ptp(draft.q, axis=0) > MIN_JOINT_RANGE)
 
 
-def check_motion_and_torque(draft: DraftRun) -> DraftRun:
+def refuse_still_runs_and_notice_still_joints(draft: DraftRun) -> DraftRun:
     """Joints that stay are said; a motion of none, or torques that stay, are refused."""
     still = ~find_moving_joints(draft)
     if still.all():
@@ -229,7 +229,7 @@ def check_motion_and_torque(draft: DraftRun) -> DraftRun:
     return draft
 
 
-def check_logged_speeds(draft: DraftRun) -> DraftRun:
+def drop_wrong_logged_speeds(draft: DraftRun) -> DraftRun:
     """Logged speeds that are the change of their joints."""
     if draft.qd is None:
         return draft
@@ -277,7 +277,7 @@ def check_logged_speeds(draft: DraftRun) -> DraftRun:
     return replace(draft, qd=None, qdd=None).with_notices(f"{text}: logged speeds are not used")
 
 
-def check_torques_are_measured(draft: DraftRun) -> DraftRun:
+def refuse_commanded_and_notice_quiet_torques(draft: DraftRun) -> DraftRun:
     """Torques that are no command: not those of a column of commands, and with some noise."""
     command = draft.log.values_by_kind.get(f"{draft.torque_kind}_cmd")
     if command is not None:
@@ -340,11 +340,11 @@ RUN_CHECKS: tuple[
     check_run_length,
     add_notices_of_sampling,
     check_angle_units,
-    unwrap_angles,
-    check_motion_and_torque,
-    check_logged_speeds,
+    unwrap_angles_or_refuse_jumps,
+    refuse_still_runs_and_notice_still_joints,
+    drop_wrong_logged_speeds,
 )
-TORQUE_CHECKS = (check_torques_are_measured, add_notices_of_clipped_torques)
+TORQUE_CHECKS = (refuse_commanded_and_notice_quiet_torques, add_notices_of_clipped_torques)
 
 
 def correct_and_check_run(draft: DraftRun) -> DraftRun:

@@ -517,7 +517,7 @@ class DraftRun(Run):
             " ..." if len(row_indices) > MAX_SHOWN_LOG_LINES else ""
         )
 
-    def build_run(self) -> Run:
+    def build_run_of_one_payload(self) -> Run:
         """The finished run.  Raises DataError for a payload that changes."""
         values = {
             kind: value[self.log_row_indices] for kind, value in self.log.values_by_kind.items()

@@ -29,7 +29,9 @@ from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers import least_squares
 from minimax_cal.solvers.least_squares import (
     LEAST_SQUARES_METHODS,
+    CostGradientGram,
     LeastSquaresLimits,
+    ReducedProblem,
     solve_normal_equations,
 )
 
@@ -472,7 +474,7 @@ class InstrumentLeastSquares:
         weight = self.known.weights(unit, self.names.parameter_count)
         return replace(self, stack=replace(self.stack, precision=unit / variance), weight=weight)
 
-    def normal(self, x: ParameterValues) -> tuple[Array, Array, Array]:
+    def normal(self, x: ParameterValues) -> CostGradientGram:
         """Cost (...), gradient (..., free) and Gram matrix (..., free, free)."""
         error, jacobian = self.stack.rows(x, self.active)
         cost = np.einsum("...r,...r->...", error, error)
@@ -484,21 +486,20 @@ class InstrumentLeastSquares:
             cost = cost + (weight * off**2).sum(axis=-1)
             gradient = gradient + weight * off
             gram = gram + self.prior
-        return np.asarray(cost), np.asarray(gradient), gram
+        return CostGradientGram(np.asarray(cost), np.asarray(gradient), gram)
 
-    def reduced(
-        self, x: ParameterValues, *, full: bool
-    ) -> tuple[ParameterValues, Array, Array, Array, Array]:
+    def reduced(self, x: ParameterValues, *, full: bool) -> ReducedProblem[ParameterValues]:
         """The states with their best linear parameters; Kaufman's variant, without coupling."""
         r, normal = self.linear, self.normal(x)
         if r.any():
-            move = np.zeros(normal[1].shape)
-            move[:, r] = solve_normal_equations(normal[2][:, r][:, :, r], normal[1][:, r, None])[
-                ..., 0
-            ]
+            move = np.zeros(normal.gradient.shape)
+            move[:, r] = solve_normal_equations(
+                normal.gram[:, r][:, :, r], normal.gradient[:, r, None]
+            )[..., 0]
             x = self.step(x, move)
             normal = self.normal(x)
-        return x, *normal, np.zeros((len(normal[0]), int(r.sum()), int((~r).sum())))
+        coupling = np.zeros((len(normal.cost), int(r.sum()), int((~r).sum())))
+        return ReducedProblem(x, *normal, coupling)
 
     def step(self, x: ParameterValues, dx: Array) -> ParameterValues:
         """The states moved by a step in the active parameters."""

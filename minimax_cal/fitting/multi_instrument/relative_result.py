@@ -12,7 +12,7 @@ import numpy as np
 
 from minimax_cal.core.arrays import Array, rms
 from minimax_cal.core.display_text import capitalise_sentence, format_first_names
-from minimax_cal.core.files import to_plain_json
+from minimax_cal.core.files import convert_to_plain_json
 from minimax_cal.core.record_fields import (
     SEPARATE_FIELD_FORMAT,
     FieldFormat,
@@ -23,10 +23,10 @@ from minimax_cal.core.record_fields import (
     scale_numbers,
 )
 from minimax_cal.core.record_parsing import (
-    convert_read_errors,
     parse_as_type,
     parse_record,
     parse_record_fields,
+    raise_read_errors_as_calibration_error,
 )
 from minimax_cal.core.results import Result, merge_nested_mappings
 from minimax_cal.core.tables import Table, drop_empty_tables
@@ -348,7 +348,7 @@ class InstrumentResult(MeasuredResult):
         told["noise"] = round_to_15_digits(scale * self.noise)
         ends = "rms_ci95_mm" if unit == "mm" else "rms_ci95"
         told["accuracy"]["holdout"][ends] = list(scale_numbers(self.interval, scale))
-        return dict(to_plain_json(told))
+        return dict(convert_to_plain_json(told))
 
     @staticmethod
     def from_dict(content: Any, at: str) -> InstrumentResult:
@@ -538,7 +538,7 @@ class RelativeCalibration(MeasuredResult, Result):
         own = {**parsed_fields, **cls.parse_measured_fields(content, "")}
         for each in (MeasuredResult(**{f.name: own[f.name] for f in fields(MeasuredResult)}),
                      *parsed_fields.get("instruments", ())):  # fmt: skip
-            with convert_read_errors(
+            with raise_read_errors_as_calibration_error(
                 source, "instrument"
             ):  # poses that are none are refused before shown
                 _ = each.frames

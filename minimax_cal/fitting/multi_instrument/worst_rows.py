@@ -14,7 +14,7 @@ from typing import Annotated, ClassVar, Self
 import numpy as np
 
 from minimax_cal.core.arrays import Array
-from minimax_cal.core.display_text import format_counts
+from minimax_cal.core.display_text import format_counts_largest_first
 from minimax_cal.core.record_fields import SEPARATE_FIELD_FORMAT, FieldFormat, derived_field
 from minimax_cal.core.tables import Table
 from minimax_cal.fitting.cell_fit import FIT_QP_TOLERANCE, MIN_TARGET_WEIGHT
@@ -22,7 +22,7 @@ from minimax_cal.fitting.multi_instrument.instrument_stack import InstrumentLeas
 from minimax_cal.fitting.options import QpSolver, build_qp_solver
 from minimax_cal.modelling.parameters import ParameterValues
 from minimax_cal.solvers import minimax
-from minimax_cal.solvers.linearisation import Kkt, Linearisation
+from minimax_cal.solvers.linearisation import FunctionsAndConstraints, Kkt, Linearisation
 from minimax_cal.solvers.minimax import Optimum
 from minimax_cal.solvers.status import Status
 
@@ -70,12 +70,12 @@ class RowMinimax:
         mean = here.curvature(np.full(len(here.f), 1.0 / len(here.f)))
         return replace(plain, scale=np.sqrt(np.maximum(np.diag(mean) / size, 1e-30)), size=size)
 
-    def evaluate(self, x: ParameterValues) -> tuple[Array, Array]:
+    def evaluate(self, x: ParameterValues) -> FunctionsAndConstraints:
         """f, and no constraint."""
         error, _ = self.problem.stack.rows(x, np.zeros(len(self.problem.active), dtype=bool))
         off, weight = self.prior_deviation_and_weight(x)
         f = self.member @ error**2 + self.known * float(weight @ off**2)
-        return f / self.size, NO_CONSTRAINT_BOUNDS
+        return FunctionsAndConstraints(f / self.size, NO_CONSTRAINT_BOUNDS)
 
     def linearise(self, x: ParameterValues) -> Linearisation:
         """f and its derivatives; the curvature is Gauss-Newton's 2 J'J."""
@@ -141,7 +141,7 @@ class WorstRows:
         return (
             f"Worst of {len(self.functions)} in training: {scale * self.before:.4f} {unit} RMS -> "
             f"{scale * self.size.max():.4f} {unit}, held by {len(self.active)}; QPs: "
-            f"{format_counts(self.answered)}."
+            f"{format_counts_largest_first(self.answered)}."
         )
 
     def table(self) -> Table:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from minimax_cal.core.display_text import blank_matches, format_first_names
+from minimax_cal.core.display_text import format_first_names, replace_matches_with_spaces
 from minimax_cal.core.errors import DataError
 from minimax_cal.measuring.importers.column_tables import (
     ImportedColumn,
@@ -161,7 +161,7 @@ def detect_language_and_targets(
 ) -> tuple[ProgramLanguage, list[ProgramTarget], str] | None:
     """The language of a program, its joint targets, and its text without strings and comments."""
     for language in PROGRAM_LANGUAGES:
-        bare = blank_matches(program_text, language.aside)
+        bare = replace_matches_with_spaces(program_text, language.aside)
         found = list(language.targets(bare))
         if len(found) >= language.least and (
             language.least == 1 or len({len(target.axes) for target in found}) == 1

@@ -77,7 +77,7 @@ def build_mass_uncertainty_function(
             np.array(
                 [
                     displacement_by_masses(scene, *other) - whole
-                    for other in scene.masses_off_by_one_sigma
+                    for other in scene.link_masses_and_centres_off_by_one_sigma
                 ]
             )
         )

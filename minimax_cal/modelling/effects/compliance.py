@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -74,7 +75,7 @@ def torque_part_choices(posed_arm: PosedArm, place: str) -> Sequence[Choice]:
     upper arm, forearm and wrist are taken apart, because their masses are free; one that another
     explains as well is left out.  Nobody tells the tool's weight then either, and it may hang
     beside the flange's axis: all joints together are tried with that too (`tool`:
-    `tool_offset_joint_mask`). A single joint is also tried as one that stiffens (`soft_range`):
+    `tool_offset_bit_mask`). A single joint is also tried as one that stiffens (`soft_range`):
     under the wrist's torque, or under that of all links with masses that are `from_masses`.
     """
     joints = find_loaded_joints(posed_arm) if place == "all" else [joint_index_from_place(place)]
@@ -94,7 +95,7 @@ def torque_part_choices(posed_arm: PosedArm, place: str) -> Sequence[Choice]:
     if not chosen:
         return ()
     parts = {"parts": numbers_to_bit_mask(chosen)}
-    tool = tool_offset_joint_mask(posed_arm) if place == "all" else 0.0
+    tool = tool_offset_bit_mask(posed_arm) if place == "all" else 0.0
     wider = ({**parts, "tool": tool},) if tool else ()
     last, own = len(LINK_GROUPS) - 1, 4 * joints[0]
     several = (
@@ -155,7 +156,7 @@ def refine_soft_range(posed_arm: PosedArm, choice: Choice) -> Sequence[Choice]:
     ]
 
 
-def tool_offset_joint_mask(posed_arm: PosedArm) -> float:
+def tool_offset_bit_mask(posed_arm: PosedArm) -> float:
     """Joints on which a tool beside the flange's axis weighs: bit 2 j for its x, 2 j + 1 for y."""
     felt = (
         tool_offset_torques(posed_arm).std(axis=2)
@@ -268,12 +269,19 @@ def soft_range_parameter_name(posed_arm: PosedArm) -> str:
     return "within_Nm" if told else "within_assumed_Nm"
 
 
-def soft_start_torque_and_slope(torque: Array, soft_range: float) -> tuple[Array, Array]:
+class SoftTorque(NamedTuple):
+    """(m,) torques that a joint's turn is proportional to, and their slopes by the torques."""
+
+    torque: Array
+    slope: Array
+
+
+def soft_start_torque_and_slope(torque: Array, soft_range: float) -> SoftTorque:
     """(m,) t tanh(tau / t) of torques (m,), t = within, and its slopes; infinite: the torques."""
     if not 0.0 < soft_range < np.inf:
-        return torque, np.ones_like(torque)
+        return SoftTorque(torque, np.ones_like(torque))
     course = np.tanh(torque / soft_range)
-    return soft_range * course, 1.0 - course**2
+    return SoftTorque(soft_range * course, 1.0 - course**2)
 
 
 JOINT_COMPLIANCE = Effect(

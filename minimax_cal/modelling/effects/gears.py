@@ -53,7 +53,7 @@ def joints_at_place(place: str, choice: Choice) -> list[int]:
     )
 
 
-def remember_joints_of_all(
+def choice_with_joints_of_all(
     place: str, joints: Sequence[int], choice: Choice = DEFAULT_CHOICES[0]
 ) -> Choice:
     """A choice that remembers which joints `all` meant, for data on which others would move."""
@@ -109,7 +109,7 @@ GEAR_ERROR = Effect(
     gear_wave_columns,
     choices=lambda scene, place: [
         *(
-            remember_joints_of_all(place, find_sweeping_joints(scene), {"turns": turns})
+            choice_with_joints_of_all(place, find_sweeping_joints(scene), {"turns": turns})
             for turns in (1.0, 2.0, 3.0)
         ),
         *([] if place == "all" else [{"orders": 2.0}]),  # a joint may show none of them alone
@@ -165,7 +165,7 @@ ENCODER_GAIN = Effect(
     "dq_j = g q_j",
     sweeping_joint_places,
     encoder_gain_columns,
-    choices=lambda scene, place: [remember_joints_of_all(place, find_sweeping_joints(scene))],
+    choices=lambda scene, place: [choice_with_joints_of_all(place, find_sweeping_joints(scene))],
     typical=1e-3,
     follows="angle",
     linear=True,
@@ -205,7 +205,7 @@ JOINT_COUPLING = Effect(
 )
 
 
-def find_joints_with_varying_column(posed_arm: PosedArm, column_stem: str) -> list[int]:
+def find_joints_whose_column_varies(posed_arm: PosedArm, column_stem: str) -> list[int]:
     """Joints whose column of the history varies; those that slide have no play in radians."""
     among = (
         find_driven_revolute_joints(posed_arm)
@@ -217,7 +217,7 @@ def find_joints_with_varying_column(posed_arm: PosedArm, column_stem: str) -> li
 
 def places_of_varying_column(posed_arm: PosedArm, column_stem: str) -> tuple[str, ...]:
     """Each of these joints, and all together."""
-    joints = find_joints_with_varying_column(posed_arm, column_stem)
+    joints = find_joints_whose_column_varies(posed_arm, column_stem)
     each = tuple(f"J{j + 1}" for j in joints)
     return (*each, "all") if len(joints) > 1 else each
 
@@ -247,14 +247,14 @@ BACKLASH = Effect(
     backlash_columns,
     needs=lambda scene: (
         ""
-        if find_joints_with_varying_column(scene, "approach")
+        if find_joints_whose_column_varies(scene, "approach")
         else (
             f"columns approach1 ... or the visit order, joints "
             f"moving both ways{scene.missing_order_clause}"
         )
     ),
     choices=lambda scene, place: [
-        remember_joints_of_all(place, find_joints_with_varying_column(scene, "approach"))
+        choice_with_joints_of_all(place, find_joints_whose_column_varies(scene, "approach"))
     ],
     typical=1e-3,
     follows="approach",
@@ -272,7 +272,7 @@ def settling_columns(posed_arm: PosedArm, place: str, choice: Choice) -> EffectC
 def settling_choices(posed_arm: PosedArm, place: str) -> Sequence[Choice]:
     """In proportion to the move, and with an end."""
     return [
-        remember_joints_of_all(place, find_joints_with_varying_column(posed_arm, "move"), choice)
+        choice_with_joints_of_all(place, find_joints_whose_column_varies(posed_arm, "move"), choice)
         for choice in ({}, {"within": LAG_RANGE_CHOICES[1]})
     ]
 
@@ -298,7 +298,7 @@ SETTLING = Effect(
     finer=refine_lag_range,
     needs=lambda scene: (
         ""
-        if find_joints_with_varying_column(scene, "move")
+        if find_joints_whose_column_varies(scene, "move")
         else "the visit order (column order)" + scene.missing_order_clause
     ),
     choices=settling_choices,

@@ -6,6 +6,8 @@ factor of its own whose variance is the spectral density at its frequency [Solin
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from minimax_cal.core.arrays import Array
@@ -47,9 +49,16 @@ def sine_count_over_span(span: float) -> int:
     return int(2.0 * span / MIN_MAP_WAVELENGTH) + 1
 
 
-def map_range_of_angles(angles: Array) -> tuple[float, float]:
+class AngleRange(NamedTuple):
+    """Ends of a range of angles [rad]."""
+
+    low: float
+    high: float
+
+
+def map_range_of_angles(angles: Array) -> AngleRange:
     """Where the curve of measured angles (m,) begins and ends [rad]."""
-    return float(angles.min()) - MAP_MARGIN, float(angles.max()) + MAP_MARGIN
+    return AngleRange(float(angles.min()) - MAP_MARGIN, float(angles.max()) + MAP_MARGIN)
 
 
 def error_map_columns(posed_arm: PosedArm, place: str, choice: Choice) -> EffectColumns:

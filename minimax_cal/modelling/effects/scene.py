@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -267,12 +268,13 @@ class PosedArm:
             return np.zeros((0, self.joints, self.poses))
         whole = self.drive_gravity_torques(*self.link_masses_and_centres)
         parts = [
-            self.drive_gravity_torques(*other) - whole for other in self.masses_off_by_one_sigma
+            self.drive_gravity_torques(*other) - whole
+            for other in self.link_masses_and_centres_off_by_one_sigma
         ]
         return np.array(parts)
 
     @cached_property
-    def masses_off_by_one_sigma(self) -> list[tuple[Array, Array]]:
+    def link_masses_and_centres_off_by_one_sigma(self) -> list[tuple[Array, Array]]:
         """Masses and centres of gravity, one of them off by its sigma each."""
         out = []
         mass, com = self.link_masses_and_centres
@@ -306,6 +308,13 @@ class PosedArm:
         weight = -STANDARD_GRAVITY * self.robot.up[:, None] * self.column("payload")
         moment = moment + kinematics.cross(tip, weight)
         return moment, np.full(self.poses, total) + self.column("payload")
+
+
+class DisplacementUncertainty(NamedTuple):
+    """Of a parameter, (r, k, 3, m) displacements that its field may differ by, one sigma each."""
+
+    parameter_index: int
+    displacements: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -347,10 +356,10 @@ class EffectColumns:
             out = out + self.shift
         return out
 
-    def displacement_uncertainties(self, posed_arm: PosedArm) -> list[tuple[int, Array]]:
-        """Parameter and (r, k, 3, m) displacements that its field may differ by, one sigma each."""
+    def displacement_uncertainties(self, posed_arm: PosedArm) -> list[DisplacementUncertainty]:
+        """Displacements by which the fields may differ, of each parameter with an uncertain one."""
         found = [(owner, doubt(posed_arm)) for owner, doubt in self.doubt.items()]
-        return [(owner, part) for owner, part in found if len(part)]
+        return [DisplacementUncertainty(owner, part) for owner, part in found if len(part)]
 
 
 MAX_LAW_VARIATIONS = 3  # independent ways in which a law may differ from the one computed

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from minimax_cal.core.arrays import Array
 from minimax_cal.core.errors import OptionError
-from minimax_cal.core.files import to_plain_json
+from minimax_cal.core.files import convert_to_plain_json
 from minimax_cal.measuring.session_frames import Frames
 from minimax_cal.modelling.effects.axis_wobble import AXIS_WOBBLE
 from minimax_cal.modelling.effects.bending import BASE_FLEX, LINK_BENDING, TOOL_FLEX
@@ -191,8 +191,16 @@ def session_frame_terms(session_frames: Frames) -> tuple[Term, ...]:
     return (Term(SESSION_JUMP.name, "frame", {"sessions": float(len(session_frames))}),)
 
 
-def parse_effect_text(effect_text: str) -> tuple[str, str, dict[str, float]]:
-    """``effect:place`` or ``effect:place:turns=17``.  Raises OptionError."""
+class ParsedEffect(NamedTuple):
+    """An effect's name, its place ("" where the text has none), and the choice of its law."""
+
+    effect: str
+    place: str
+    choice: dict[str, float]
+
+
+def parse_effect_text(effect_text: str) -> ParsedEffect:
+    """Parse ``effect:place`` or ``effect:place:turns=17``.  Raises OptionError."""
     name, _, rest = effect_text.strip().partition(":")
     place, _, more = rest.partition(":")
     choice: dict[str, float] = {}
@@ -208,7 +216,7 @@ def parse_effect_text(effect_text: str) -> tuple[str, str, dict[str, float]]:
             )
     if name not in EFFECTS:
         raise OptionError(f"no effect {name!r}; choose {', '.join(EFFECTS)}")
-    return name, place, choice
+    return ParsedEffect(name, place, choice)
 
 
 ChooseVariant = Callable[
@@ -370,7 +378,7 @@ class Fitted:
     def to_list(self) -> list[dict[str, object]]:
         """For JSON, in SI; an infinite time constant is null."""
         return [
-            to_plain_json(
+            convert_to_plain_json(
                 {"effect": t.effect, "place": t.place, "choice": t.choice, "values": value}
             )
             for t, value in self.terms_with_values

@@ -52,14 +52,14 @@ class ExperimentPool:
         """f."""
         return int(self.sensitivities.shape[-1])
 
-    def weighted_information(self, repetitions: Array) -> Array:
+    def information_of_repetitions(self, repetitions: Array) -> Array:
         """(f, f) of a design.  repetitions: (c,) how often each experiment is done."""
         chosen = np.flatnonzero(repetitions)
         scaled = self.sensitivities[chosen] * np.sqrt(repetitions[chosen])[:, None, None]
         flat = scaled.reshape(-1, self.unknown_count)
         return np.asarray(self.prior_information + flat.T @ flat)
 
-    def sum_information(self, chosen: Array) -> Array:
+    def information_of_experiments(self, chosen: Array) -> Array:
         """(f, f) information of some experiments.  chosen: indices, repeated where repeated."""
         flat = self.sensitivities[chosen].reshape(-1, self.unknown_count)
         return np.asarray(self.prior_information + flat.T @ flat)
@@ -115,7 +115,7 @@ def maximise_criterion_lower_bound(
     """
     weights, bound = np.bincount(design_indices, minlength=pool.experiment_count).astype(float), 0.0
     for step in range(MAX_FRANK_WOLFE_STEPS):
-        cov = invert_information_matrices(pool.weighted_information(weights))
+        cov = invert_information_matrices(pool.information_of_repetitions(weights))
         pull = inverse_criterion_gradient(cov, criterion.equivalent_trace_weight(cov))
         bound = max(bound, criterion_lower_bound(pool, pull, len(design_indices)))
         ahead = np.zeros(pool.experiment_count)
@@ -158,7 +158,7 @@ def improve_design_by_exchange(
     )
     offer = pool.sensitivities[some]
     chosen = np.array(start_indices)
-    info = pool.sum_information(chosen)
+    info = pool.information_of_experiments(chosen)
     best = evaluate_information_matrix(criterion, info)
     ridge = EXCHANGE_RELATIVE_RIDGE * np.diag(np.maximum(np.diag(info), 1e-300))
     for _ in range(max_sweeps):
@@ -179,9 +179,9 @@ def improve_design_by_exchange(
                 info = trial[winner]
         if not swapped:
             break
-        info = pool.sum_information(chosen)  # rounding does not add up
+        info = pool.information_of_experiments(chosen)  # rounding does not add up
     return ExperimentDesign(
-        chosen, evaluate_information_matrix(criterion, pool.sum_information(chosen))
+        chosen, evaluate_information_matrix(criterion, pool.information_of_experiments(chosen))
     )
 
 
@@ -219,7 +219,7 @@ def evaluate_random_designs(
                 criterion,
                 np.array(
                     [
-                        pool.sum_information(
+                        pool.information_of_experiments(
                             rng.choice(pool.experiment_count, count, replace=False)
                         )
                         for _ in range(designs_per_size)

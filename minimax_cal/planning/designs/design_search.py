@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -116,17 +117,24 @@ def search_best_design(
     )
 
 
+class WeightedDesign(NamedTuple):
+    """Experiments, and the weight (f, f) of the covariance by which they were scored."""
+
+    experiment_indices: Array
+    covariance_weight: Array
+
+
 def add_promising_experiments(
     pool: ExperimentPool, criterion: OptimalityCriterion, design_indices: Array
-) -> tuple[Array, Array]:
+) -> WeightedDesign:
     """A design with the experiments that it scores highest, and its weight of the covariance."""
-    cov = invert_information_matrices(pool.sum_information(design_indices))
+    cov = invert_information_matrices(pool.information_of_experiments(design_indices))
     mix = criterion.equivalent_trace_weight(cov)
     few = find_largest_indices(
         pool.score_experiments(inverse_criterion_gradient(cov, mix)),
         CONSIDERED_PER_CHOSEN_EXPERIMENT * len(design_indices) + CONSIDERED_IN_ADDITION,
     )
-    return np.union1d(design_indices, few), mix
+    return WeightedDesign(np.union1d(design_indices, few), mix)
 
 
 def build_identifiable_greedy_design(
@@ -134,14 +142,14 @@ def build_identifiable_greedy_design(
 ) -> Array:
     """A greedy design that tells all unknowns.  Raises OptionError with how many it takes."""
     chosen = build_greedy_design(pool, criterion, design_size)
-    if np.isfinite(evaluate_information_matrix(criterion, pool.sum_information(chosen))):
+    if np.isfinite(evaluate_information_matrix(criterion, pool.information_of_experiments(chosen))):
         return chosen
     longer = build_greedy_design(
         pool, criterion, min(design_size + MAX_ADDITIONAL_EXPERIMENTS, pool.experiment_count)
     )
     for needed in range(design_size + 1, len(longer) + 1):
         if np.isfinite(
-            evaluate_information_matrix(criterion, pool.sum_information(longer[:needed]))
+            evaluate_information_matrix(criterion, pool.information_of_experiments(longer[:needed]))
         ):
             raise OptionError(
                 f"{design_size} poses do not tell the {pool.unknown_count}"

@@ -7,7 +7,7 @@ concave in M [Pukelsheim 1993, chapter 5].
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -125,13 +125,20 @@ class LargestEigenvalueCriterion:
         )
 
 
-def woodbury_products(covariance: Array, experiment_sensitivities: Array) -> tuple[Array, Array]:
+class WoodburyProducts(NamedTuple):
+    """A C (c, r, f) and 1 + A C A' (c, r, r)."""
+
+    across: Array
+    inner: Array
+
+
+def woodbury_products(covariance: Array, experiment_sensitivities: Array) -> WoodburyProducts:
     """A C (c, r, f) and 1 + A C A' (c, r, r) for rows A (c, r, f)."""
     c, r, f = experiment_sensitivities.shape
     across = (experiment_sensitivities.reshape(c * r, f) @ covariance).reshape(c, r, f)
     inner = across @ np.swapaxes(experiment_sensitivities, 1, 2)
     inner[:, np.arange(r), np.arange(r)] += 1.0
-    return across, inner
+    return WoodburyProducts(across, inner)
 
 
 def weighted_trace_after_adding(

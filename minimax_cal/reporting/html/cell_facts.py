@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from minimax_cal.core.display_text import replace_control_characters
+from minimax_cal.core.display_text import replace_invisible_and_bidi_characters
 from minimax_cal.core.errors import OptionError
 from minimax_cal.core.files import read_toml
 from minimax_cal.measuring.measurements import Measurements
@@ -37,11 +37,13 @@ def read_facts_file(path: Path | str) -> dict[str, str]:
             near = get_close_matches(key, known, 1)
             hint = f"; {near[0]} is meant?" if near else f"; choose {', '.join(known)}"
             raise OptionError(
-                f"{path}: the key {replace_control_characters(key)!r} is not known{hint}"
+                f"{path}: the key {replace_invisible_and_bidi_characters(key)!r} is not known{hint}"
             )
         if isinstance(value, dict | list):
             raise OptionError(f"{path}: {key} must be a text or a number")
-    return {key: replace_control_characters(str(value)) for key, value in content.items()}
+    return {
+        key: replace_invisible_and_bidi_characters(str(value)) for key, value in content.items()
+    }
 
 
 def list_labelled_facts(

@@ -450,7 +450,9 @@ def build_first_page_blocks(
             else []
         )
     lines += [
-        build_text_note(one.sentence() + ".") for one in judgement.judgements if not one.plain
+        build_text_note(one.sentence() + ".")
+        for one in judgement.judgements
+        if not one.is_explained_by_numbers
     ]
     lines += [build_text_note(which) for which in explain_which_model_is_signed(sources, judgement)]
     lines += [NoteBlock(notice, alarm) for notice in sources.notices]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from minimax_cal.core.arrays import Array
-from minimax_cal.core.display_text import replace_control_characters
+from minimax_cal.core.display_text import replace_invisible_and_bidi_characters
 from minimax_cal.core.errors import CalibrationError, OptionError
 from minimax_cal.core.tables import Table, drop_empty_tables
 from minimax_cal.dynamics.laws import TORQUE_EFFECT_WORDS
@@ -104,14 +104,16 @@ def build_motion_report(source: MotionReportSource, request: ReportRequest) -> R
     found = source.diagnosis
     robot = found.arm.robot.name
     facts = [
-        ("Robot", replace_control_characters(robot)),
+        ("Robot", replace_invisible_and_bidi_characters(robot)),
         *list_labelled_facts(request.facts, None),
     ]
     facts += (
-        [("Customer", replace_control_characters(request.customer))] if request.customer else []
+        [("Customer", replace_invisible_and_bidi_characters(request.customer))]
+        if request.customer
+        else []
     )
     facts += [("Date of this report", request.date), ("Held out", found.held_out)]
-    facts += [("Logs", ", ".join(map(replace_control_characters, found.runs)))]
+    facts += [("Logs", ", ".join(map(replace_invisible_and_bidi_characters, found.runs)))]
     worst = np.argsort(-np.array(found.budget[-1].holdout_rms_moving))
     sheets = (
         ReportSection("verdict", "Result", build_motion_verdict_blocks(found)),
@@ -135,12 +137,13 @@ def build_motion_report(source: MotionReportSource, request: ReportRequest) -> R
         ReportSection("provenance", "Provenance", build_motion_provenance_tables(source)),
     )
     return ReportDocument(
-        title=replace_control_characters(request.title)
-        or f"Torques of {replace_control_characters(robot)}",
-        robot=replace_control_characters(robot),
+        title=replace_invisible_and_bidi_characters(request.title)
+        or f"Torques of {replace_invisible_and_bidi_characters(robot)}",
+        robot=replace_invisible_and_bidi_characters(robot),
         facts=tuple(facts),
         signatures=list_signatures(
-            replace_control_characters(request.author), replace_control_characters(request.customer)
+            replace_invisible_and_bidi_characters(request.author),
+            replace_invisible_and_bidi_characters(request.customer),
         ),
         sections=join_pages_and_appendix(sheets, more, request.appendix),
         digest="",
@@ -256,7 +259,7 @@ def build_torque_and_friction_chart(diagnosis: MotionDiagnosis, joint_index: int
     left = diagnosis.budget[-1].holdout_rms_moving[joint_index]
     says = (
         f"Torque of joint {joint_index + 1} on a part of "
-        f"{replace_control_characters(run.name)}, which the fit did not see "
+        f"{replace_invisible_and_bidi_characters(run.name)}, which the fit did not see "
         f"(it misses {left:.3g} {unit} RMS where the joint moves), and its friction over speed."
     )
     return ChartBlock(
@@ -284,5 +287,9 @@ def build_untestable_effect_blocks(diagnosis: MotionDiagnosis) -> tuple[ReportBl
 
 def build_motion_provenance_tables(source: MotionReportSource) -> tuple[ReportBlock, ...]:
     """The file and the programs."""
-    row = ("motion diagnosis", replace_control_characters(source.file.path), source.file.digest)
+    row = (
+        "motion diagnosis",
+        replace_invisible_and_bidi_characters(source.file.path),
+        source.file.digest,
+    )
     return Table.from_rows("Files", [row], FILE_TABLE_COLUMNS), build_program_version_table()

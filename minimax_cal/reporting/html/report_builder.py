@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from importlib.metadata import version
 from typing import Any
 
-from minimax_cal.core.display_text import replace_control_characters
+from minimax_cal.core.display_text import replace_invisible_and_bidi_characters
 from minimax_cal.core.tables import Table, drop_empty_tables
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.reporting.html import report_appendix, report_pages
@@ -107,7 +107,9 @@ def build_report(
     data = sources.results[0].data if not sources.relative else None
     facts = [("Robot", sources.robot), *list_labelled_facts(request.facts, data)]
     facts += (
-        [("Customer", replace_control_characters(request.customer))] if request.customer else []
+        [("Customer", replace_invisible_and_bidi_characters(request.customer))]
+        if request.customer
+        else []
     )
     facts += [("Date of this report", request.date), ("Poses", describe_pose_counts(sources))]
     facts += [("Measurements", strip_folders(told.data) or "not named")]
@@ -126,11 +128,12 @@ def build_report(
     ]
     more += report_appendix.find_tables_not_shown(sources, [*sheets, *more])
     return ReportDocument(
-        title=replace_control_characters(request.title) or f"{kind} of {sources.robot}",
+        title=replace_invisible_and_bidi_characters(request.title) or f"{kind} of {sources.robot}",
         robot=sources.robot,
         facts=tuple(facts),
         signatures=list_signatures(
-            replace_control_characters(request.author), replace_control_characters(request.customer)
+            replace_invisible_and_bidi_characters(request.author),
+            replace_invisible_and_bidi_characters(request.customer),
         ),
         sections=join_pages_and_appendix(
             sheets, [*more, build_provenance_section(sources)], request.appendix
@@ -141,7 +144,7 @@ def build_report(
 
 def strip_folders(file_text: str) -> str:
     """Files without the folders of the machine; what is no file stays as it is."""
-    return FOLDER_PREFIX_PATTERN.sub("", replace_control_characters(file_text))
+    return FOLDER_PREFIX_PATTERN.sub("", replace_invisible_and_bidi_characters(file_text))
 
 
 def list_signatures(author: str, customer: str) -> tuple[tuple[str, str], ...]:

@@ -11,7 +11,7 @@ from operator import itemgetter
 import numpy as np
 
 from minimax_cal.core.display_text import capitalise_sentence, format_first_names
-from minimax_cal.core.record_parsing import convert_read_errors
+from minimax_cal.core.record_parsing import raise_read_errors_as_calibration_error
 from minimax_cal.core.tables import Table, drop_empty_tables
 from minimax_cal.diagnosing.diagnosis import Diagnosis
 from minimax_cal.diagnosing.diagnosis_sentences import describe_extrapolation, describe_main_causes
@@ -150,7 +150,7 @@ def build_error_location_page(sources: ReportSources) -> ReportBlocks:
         drawn.append(build_missing_note(NO_POSES_NOTE))
     if gap and gap.where:
         drawn.append(build_text_note(BEFORE_EFFECTS_NOTE))
-        with convert_read_errors("diagnosis", "where"):
+        with raise_read_errors_as_calibration_error("diagnosis", "where"):
             drawn += build_error_location_tables(gap.where, largest_joint_rotations(sources))
     elif poses:
         drawn.append(build_error_by_joint_chart(poses, names))

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from minimax_cal.core.arrays import Array
-from minimax_cal.core.display_text import replace_control_characters
+from minimax_cal.core.display_text import replace_invisible_and_bidi_characters
 from minimax_cal.core.errors import CalibrationError
 from minimax_cal.core.files import parse_json, read_bytes
 from minimax_cal.core.record_parsing import WRITE_AGAIN_ADVICE
@@ -298,14 +298,14 @@ def read_json_object(path: Path | str) -> tuple[dict[str, Any], str]:
 
 
 def replace_control_characters_in_json(value: Any) -> Any:
-    """The same with every text visible: `replace_control_characters`."""
+    """The same with every text visible: `replace_invisible_and_bidi_characters`."""
     if isinstance(value, str):
-        return replace_control_characters(value)
+        return replace_invisible_and_bidi_characters(value)
     if isinstance(value, list):
         return [replace_control_characters_in_json(part) for part in value]
     if isinstance(value, dict):
         return {
-            replace_control_characters(key): replace_control_characters_in_json(part)
+            replace_invisible_and_bidi_characters(key): replace_control_characters_in_json(part)
             for key, part in value.items()
         }
     return value

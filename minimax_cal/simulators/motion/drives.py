@@ -14,7 +14,7 @@ from scipy.linalg import block_diag
 
 from minimax_cal.core.arrays import Array
 from minimax_cal.core.errors import OptionError, RobotError
-from minimax_cal.core.files import format_json, to_plain_json, write_file_atomically
+from minimax_cal.core.files import convert_to_plain_json, format_json, write_file_atomically
 from minimax_cal.dynamics.drives import (
     COMMAND_DELAY_EFFECT,
     COULOMB_FRICTION,
@@ -188,7 +188,7 @@ def read_model_drives(chain: ModelArm) -> tuple[PositionDrive, ...]:
     """(n) the position servos of a model."""
     model, out = chain.model, []
     late = getattr(model, "actuator_delay", np.zeros(model.nu))[chain.servo_ids].tolist()
-    servos, forward = chain.read_servos(), chain.find_feed_forward()
+    servos, forward = chain.read_servos(), chain.find_feed_forward_joints_by_actuator()
     for j in range(len(chain.joint_ids)):
         ahead = sum(float(model.actuator_gainprm[k, 0]) for k, i in forward.items() if i == j)
         whole = float(servos.damper[j]) + ahead
@@ -307,7 +307,7 @@ def are_logs_without_joint_dampers(judge: MotionJudge, opened: OpenedModel) -> b
 
 def body_torque_function(chain: ModelArm) -> BodyTorqueFunction:
     """Torque that the masses of a model alone take for a motion, whatever carries them."""
-    mj, model, data, at, dofs = replace(chain, model=copy(chain.model)).new_data()
+    mj, model, data, at, dofs = replace(chain, model=copy(chain.model)).create_data_with_indices()
     model.opt.disableflags |= int(mj.mjtDisableBit.mjDSBL_CONSTRAINT)
     for name in ("dof_armature", "dof_damping", "jnt_stiffness", "body_gravcomp"):
         getattr(model, name)[:] = 0.0
@@ -348,10 +348,15 @@ def write_drives(
             damper = (1.0 - drive.ahead) * drive.damper
             set_servo_gains(servo, drive.stiffness / gear**2, damper / gear**2)
             if forward := drive.ahead * drive.damper:
-                set_element(tree.section("actuator"), "velocity", f"{name}_ahead", joint=name,
-                            kv=forward)  # fmt: skip
+                set_element(
+                    tree.section_or_new("actuator"),
+                    "velocity",
+                    f"{name}_ahead",
+                    joint=name,
+                    kv=forward,
+                )
             else:
-                tree.remove("actuator", "velocity", f"{name}_ahead")
+                tree.remove_elements("actuator", "velocity", f"{name}_ahead")
 
         # Torque limit: of the joint where actuators carry gravity, else of the servo.
         if drive.torque != own.torque:
@@ -370,7 +375,7 @@ def write_drives(
                 actuator.attrib |= delay_attributes(drive.delay, step)
     damping = np.array([d.damper for d in drives]) * step * model.dof_invweight0[chain.dof_indices]
     if model.opt.integrator not in IMPLICIT_INTEGRATORS and damping.max() > MAX_EXPLICIT_DAMPING:
-        tree.section("option").set("integrator", "implicitfast")
+        tree.section_or_new("option").set("integrator", "implicitfast")
     if gravity_share != read_gravity_share(chain):
         for body in tree.find_parents()[joints[0]].iter("body"):
             body.set("gravcomp", format_exact_numbers([gravity_share]))
@@ -433,7 +438,7 @@ def write_actuators(
     if file_format == "json":
         content = {"schema": 1, "kind": "actuators", "model": name, "timestep": step,
                    "joints": joints}  # fmt: skip
-        write_file_atomically(Path(path), format_json(to_plain_json(content)))
+        write_file_atomically(Path(path), format_json(convert_to_plain_json(content)))
         return
 
     # Isaac Lab has a group of actuators for each delay, and no infinite limits.
@@ -553,7 +558,7 @@ def write_ranges(
         )
     ]
     content = {"schema": 1, "kind": "ranges", "parameters": parameters, "covariance": whole}
-    write_file_atomically(Path(path), format_json(to_plain_json(content)))
+    write_file_atomically(Path(path), format_json(convert_to_plain_json(content)))
 
 
 # ---- by commands and positions alone -------------------------------------------------------------
@@ -586,7 +591,7 @@ def correct_by_positions(
 
     Raises OptionError without servos to correct.
     """
-    if filtered := opened.chain.find_filtered_servos():
+    if filtered := opened.chain.name_joints_with_filtered_commands():
         raise OptionError(
             f"{opened.given.source}: the servos of {filtered} filter their commands (dyntype or "
             "timeconst): positions alone do not correct them; leave the filter out of the model, "

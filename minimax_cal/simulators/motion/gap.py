@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from minimax_cal.core.errors import OptionError
-from minimax_cal.core.files import check_writable
+from minimax_cal.core.files import check_output_path
 from minimax_cal.core.option_fields import take_option_fields_as_keywords
 from minimax_cal.core.progress_stages import Progress, silent_progress
 from minimax_cal.core.threads import limit_blas_to_one_thread
@@ -108,13 +108,13 @@ def motion_gap(
     """
     began = time.perf_counter()
     if write is not None:
-        check_writable(write, MJCF_SUFFIXES)
+        check_output_path(write, MJCF_SUFFIXES)
     import_mujoco()
     if actuators and actuators[0] not in ("isaac", "json"):
         raise OptionError(f"actuators={actuators[0]!r}: give isaac or json, and a file")
     for file in (actuators and actuators[1], randomize):
         if file is not None:
-            check_writable(file)
+            check_output_path(file)
     progress("reading the model and the logs")
     runs = read_runs_of_robot(model, logs)
     opened = open_model(model, runs[0].joints if runs else 0, tip)
@@ -203,7 +203,7 @@ def correct_by_torques(
 
     # Elements of the body, from torques.
     made = correct_elements(candidates, diagnosis, progress)
-    notices, filtered = made.notices, candidates.opened.chain.find_filtered_servos()
+    notices, filtered = made.notices, candidates.opened.chain.name_joints_with_filtered_commands()
     if judge.drive_text == OWN_SERVOS_TEXT and filtered:
         text = f"the servos of {filtered} filter their commands: gains and delay stay as they are"
         notices = (*notices, text)
@@ -253,6 +253,6 @@ def build_candidate_models(
     """Where corrections of a model are fitted and judged.  portable: as of `CandidateModels`."""
     assumed = opened.given.assumed or opened.chain.has_assumed_masses
     study = FitData.of(opened.chain, judge.arm, judge.learning_logs, diagnosis.models[-1].terms,
-                     opened.chain.find_largest_inertias(),
+                     opened.chain.largest_inertias_over_workspace(),
                      ASSUMED_BODY_PRIOR_SIGMA if assumed else BODY_PRIOR_SIGMA)  # fmt: skip
     return CandidateModels(judge, opened, study, portable)

@@ -55,7 +55,7 @@ class PdGains:
 
 def compute_inverse_torque(chain: ModelArm, logs: MotionLogs) -> Array:
     """(M, n) torque that a model takes for the motion of logs, as its drives feel it [N m]."""
-    mj, model, data, at, dofs = chain.new_data()
+    mj, model, data, at, dofs = chain.create_data_with_indices()
     out = np.empty(logs.motion.q.shape)
     floating = ~model.jnt_actgravcomp[list(chain.joint_ids)].astype(bool)
     motion = logs.motion
@@ -72,7 +72,7 @@ def simulate_commands(chain: ModelArm, run: Run, commands: Array, source: str) -
     commands: (m, n) at the times of the run [rad, m].  Raises RobotError for an unstable model.
     """
     servos = chain.servo_ids
-    speeds = chain.find_feed_forward()
+    speeds = chain.find_feed_forward_joints_by_actuator()
 
     def drive(data: Any, now: int) -> None:
         data.ctrl[servos] = path[now]
@@ -119,7 +119,7 @@ def simulate_torques(
 
 def inertia_scaled_holding_torque(chain: ModelArm) -> HoldingTorque:
     """Drives whose gains follow the inertia of an arm: critically damped."""
-    mj, model, data, at, dofs = chain.new_data()
+    mj, model, data, at, dofs = chain.create_data_with_indices()
     wanted, torque = np.zeros(model.nv), np.zeros(model.nv)
 
     def pull(q: Array, off: Array, slow: Array) -> Array:
@@ -142,7 +142,7 @@ def simulate_run(
     chain: ModelArm, run: Run, apply_controls: Callable[[Any, int], None], source: str
 ) -> Array:
     """(m, n) joint values at the times of a run.  apply_controls: sets what acts at a step."""
-    mj, model, data, at, dofs = chain.new_data()
+    mj, model, data, at, dofs = chain.create_data_with_indices()
     start = scipy.interpolate.CubicSpline(run.time, run.q)
     data.qpos[at], data.qvel[dofs] = start(run.time[0]), start(run.time[0], 1)
     time = timesteps_along_log(run.time, chain)
@@ -223,7 +223,7 @@ class MotionJudge:
         )
         return MotionJudge(
             arm,
-            opened.chain.find_largest_inertias(),
+            opened.chain.largest_inertias_over_workspace(),
             resample_and_filter_runs(learning),
             tuple(learning),
             resample_and_filter_runs(held),

@@ -307,7 +307,7 @@ def write_model_parameters(
             old_gear = [float(v) for v in actuator.get("gear", "1").split()]
             actuator.set("gear", format_exact_numbers([old_gear[0] / gain, *old_gear[1:]]))
         if delay and found.delay > 0.0:
-            sensors = tree.section("sensor")
+            sensors = tree.section_or_new("sensor")
             set_element(sensors, "jointactuatorfrc", f"{name}_torque", joint=name, **delay)
         elif delay:
             for actuator in actuators:
@@ -422,7 +422,7 @@ class OpenedModel:
             if is_held[i]:
                 servo = chain.model.actuator(chain.servo_ids[i])
                 damper = float(joint.attrib.pop("damping")) / float(servo.gear[0]) ** 2
-                set_element(tree.section("actuator"), "position", str(servo.name), kv=damper)
+                set_element(tree.section_or_new("actuator"), "position", str(servo.name), kv=damper)
         return self.with_document(self.given.document)
 
     def has_correctable_servos(self) -> bool:
@@ -448,14 +448,14 @@ def open_model(
     import_mujoco()
     if Path(model).suffix.lower() in MJCF_SUFFIXES and not is_urdf_source(Path(model)):
         given = read_mujoco_model(model)
-        chain = ModelArm.find(given, joint_count, tip)
+        chain = ModelArm.find_in_model(given, joint_count, tip)
         opened = OpenedModel(given, chain, is_new=False)
         return opened.move_dampers_to_servos() if with_free_joints else opened
     robot = load_robot(model)
     if robot.joints != joint_count:
         raise OptionError(f"{model}: has {robot.joints} joints, the logs have {joint_count}")
     given = MjcfModel(str(model), new_model(robot), Path())
-    chain = ModelArm.find(given, joint_count)
+    chain = ModelArm.find_in_model(given, joint_count)
     opened = OpenedModel(given, chain, is_new=True)
     return opened.move_dampers_to_servos() if with_free_joints else opened
 

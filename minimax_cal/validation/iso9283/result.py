@@ -66,6 +66,15 @@ class IsoCondition(NamedTuple):
     told: str
 
 
+class IsoRow(NamedTuple):
+    """A part of the poses and a cell, their words, and the values of the cell there."""
+
+    part_name: str
+    cell_name: str
+    part: IsoPart
+    values: IsoAccuracy
+
+
 @dataclass(frozen=True, eq=False)
 class Iso9283(Result):
     """Values by the formulas of ISO 9283 on held-out and on training poses, before and after.
@@ -83,15 +92,15 @@ class Iso9283(Result):
     conditions: tuple[IsoCondition, ...]
     notices: tuple[str, ...] = ()
 
-    def rows(self) -> list[tuple[str, str, IsoPart, IsoAccuracy]]:
+    def rows(self) -> list[IsoRow]:
         """Every part with every cell, and their words."""
         return [
-            (ISO_PART_NAMES[key], name, part, values)
+            IsoRow(ISO_PART_NAMES[key], name, part, values)
             for key, part in self.parts.items()
             for name, values in part.values.items()
         ]
 
-    def position_table(self) -> Table:
+    def pose_accuracy_table(self) -> Table:
         """AP of the TCP."""
         rows = (
             (title, name, *summary_figures(size), *(1e3 * rms(axis) for axis in values.position.T),
@@ -203,7 +212,7 @@ class Iso9283(Result):
     def tables(self, *, poses: bool = False) -> tuple[Table, ...]:
         """Every table that holds something.  poses: with a row for each pose."""
         return drop_empty_tables(
-            self.position_table(), self.target_table(), self.orientation_table(),
+            self.pose_accuracy_table(), self.target_table(), self.orientation_table(),
             self.distance_table(), self.repeat_table(), *([self.pose_table()] if poses else []),
             self.conditions_table(),
         )  # fmt: skip
@@ -265,12 +274,21 @@ def lengths_mm(off: Array) -> Array:
     return np.asarray(1e3 * np.linalg.norm(off, axis=1))
 
 
-def summary_figures(values: Array) -> tuple[int, float, float, float]:
+class SummaryFigures(NamedTuple):
+    """Of some values; NaN where there is none."""
+
+    value_count: int
+    mean: float
+    rms: float
+    largest: float
+
+
+def summary_figures(values: Array) -> SummaryFigures:
     """Count, mean, RMS and largest size of some values; NaN without any."""
     known = values[np.isfinite(values)]
     if not len(known):
-        return 0, math.nan, math.nan, math.nan
-    return len(known), float(known.mean()), rms(known), float(np.abs(known).max())
+        return SummaryFigures(0, math.nan, math.nan, math.nan)
+    return SummaryFigures(len(known), float(known.mean()), rms(known), float(np.abs(known).max()))
 
 
 def figures_in_thousandths(values: Array | Mapping[str, Any]) -> dict[str, Any]:
@@ -318,8 +336,17 @@ def compute_iso9283(
     return Iso9283(robot, data.source, data.target_names, told, parts, asked, notices)
 
 
-def parse_tcp(data: Measurements, tcp: str | Sequence[float]) -> tuple[int | Array, str]:
-    """The TCP for `build_cell_view`, and in words.  Raises OptionError."""
+class ParsedTcp(NamedTuple):
+    """The TCP as `build_cell_view` takes it, and in words."""
+
+    tcp: int | Array
+    text: str
+
+
+def parse_tcp(data: Measurements, tcp: str | Sequence[float]) -> ParsedTcp:
+    """Parse the TCP: a target's name, a point of the flange, or the centroid.  Raises
+    OptionError.
+    """
     if isinstance(tcp, str):
         if tcp != "centroid" and tcp not in data.target_names:
             raise OptionError(
@@ -327,15 +354,15 @@ def parse_tcp(data: Measurements, tcp: str | Sequence[float]) -> tuple[int | Arr
             )
         if tcp == "centroid":
             centre = "the targets' centroid" if len(data.target_names) > 1 else data.target_names[0]
-            return np.zeros(0), centre
-        return data.target_names.index(tcp), tcp
+            return ParsedTcp(np.zeros(0), centre)
+        return ParsedTcp(data.target_names.index(tcp), tcp)
     point = np.asarray(tcp, dtype=float)
     if point.shape != (3,) or not np.isfinite(point).all():
         raise OptionError("the TCP: give three numbers X,Y,Z in the last frame")
     if len(data.target_names) < 3:
         raise DataError(f"{data.source}: a TCP away from the targets needs three of them")
     x, y, z = 1e3 * point
-    return point, f"the point {x:g}, {y:g}, {z:g} mm of the flange"
+    return ParsedTcp(point, f"the point {x:g}, {y:g}, {z:g} mm of the flange")
 
 
 def build_iso_part(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,6 +36,13 @@ MIN_GIMBAL_LOCK_COSINE = 0.1  # |cos b| below which a and c exaggerate a turn mo
 MAX_PAIRED_POSES = 3000  # poses whose pairs are all formed
 
 
+class StopPoses(NamedTuple):
+    """Names of the P poses as they were first visited, and (v,) the number of each stop's."""
+
+    names: Array
+    numbers: Array
+
+
 @dataclass(frozen=True, eq=False)
 class ArmStops:
     """Every stop of the arm, in the order of visits.
@@ -53,11 +61,11 @@ class ArmStops:
     linked: Array
     held: Array
 
-    def poses(self) -> tuple[Array, Array]:
+    def poses(self) -> StopPoses:
         """Names of the P poses as they were first visited, and (v,) the number of each stop's."""
         names, first, number = np.unique(self.pose, return_index=True, return_inverse=True)
         order = np.argsort(first)
-        return names[order], np.argsort(order)[number]
+        return StopPoses(names[order], np.argsort(order)[number])
 
     def take(self, rows: Array) -> ArmStops:
         """Some of the stops.  rows: (v,) mask."""

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,7 +35,7 @@ from minimax_cal.validation.monitoring.change_search import (
     ChangeSearch,
     joint_name_of_parameter,
     search_changes,
-    with_joint_changes,
+    with_jointly_estimated_changes,
 )
 from minimax_cal.validation.monitoring.check_result import (
     ASKED_ZERO_SHIFT,
@@ -53,7 +54,7 @@ from minimax_cal.validation.tolerance import (
     MIN_POSES_FOR_MAXIMUM,
     REFUSAL_REASONS,
     ToleranceLimit,
-    parse_limits,
+    parse_tolerance_limits,
 )
 
 KNOWN_CHOICES = ("frame", "targets")  # what may still be where it was
@@ -108,7 +109,7 @@ def check(
     --------
     >>> mc.check("fit.json", "ten_poses.csv", "rms 0.2").valid
     """
-    limits = parse_limits(tolerance)
+    limits = parse_tolerance_limits(tolerance)
     if not limits:
         raise OptionError(f"tolerance {tolerance!r}: write it in mm as rms 0.2, max 0.5")
     known = tuple(split_names(known))
@@ -145,7 +146,7 @@ def check(
         verdicts = tuple(replace(one, valid=False, confidence=sure, why=why) for one in verdicts)
 
     # The same with the points that were set aside.
-    error, counted = correct_for_used_freedom(error, before.used), None
+    error, counted = inflate_errors_for_placed_coordinates(error, before.used), None
     if data.set_aside:
         cell = watched.cell
         now = Cell.from_parameters(
@@ -161,10 +162,12 @@ def check(
     return CheckResult(
         robot=robot.name,
         verdicts=verdicts,
-        moved=with_joint_changes(watched, after, found.named),
+        moved=with_jointly_estimated_changes(watched, after, found.named),
         hidden=tuple(find_inseparable_zeros(watched, found)),
         accuracy=summarise_point_errors(error),
-        refitted=summarise_point_errors(correct_for_used_freedom(corrected, after.used)),
+        refitted=summarise_point_errors(
+            inflate_errors_for_placed_coordinates(corrected, after.used)
+        ),
         findable=smallest_shifts,
         sliding=frozenset(f"d{j + 1}" for j in np.flatnonzero(robot.prismatic)),
         enough=enough_poses,
@@ -201,9 +204,15 @@ def find_inseparable_zeros(watched: MonitoredArm, found: ChangeSearch) -> Iterat
             yield InseparableZero(names.all_names[zero], "frame and tool", "poses that differ more")
 
 
-def detectable_shifts(
-    watched: MonitoredArm, found: ChangeSearch
-) -> tuple[dict[str, float], int | None, int | None]:
+class DetectableShifts(NamedTuple):
+    """The smallest shift of each zero that is found; poses that are enough, and needed, or None."""
+
+    smallest: dict[str, float]
+    enough_pose_count: int | None
+    needed_pose_count: int | None
+
+
+def detectable_shifts(watched: MonitoredArm, found: ChangeSearch) -> DetectableShifts:
     """The smallest shift of each zero position that is found; poses that are enough, and needed."""
     tested, names = found.looked, watched.names.all_names
     zeros = tested.column[tested.zero]
@@ -212,10 +221,10 @@ def detectable_shifts(
     joints = [int(joint_name_of_parameter(names[i])[1:]) - 1 for i in zeros]
     turning = ~watched.cell.robot.prismatic[joints]
     if not turning.any():
-        return smallest, None, None
+        return DetectableShifts(smallest, None, None)
     worst = float(np.max(least[turning]))
     needed = max(math.ceil(watched.data.poses * (worst / ASKED_ZERO_SHIFT) ** 2), MIN_PLACING_POSES)
-    return smallest, (needed if worst <= ASKED_ZERO_SHIFT else None), needed
+    return DetectableShifts(smallest, (needed if worst <= ASKED_ZERO_SHIFT else None), needed)
 
 
 def warn_of_noise(both: SessionPair) -> Iterator[str]:
@@ -239,11 +248,11 @@ def warn_of_noise(both: SessionPair) -> Iterator[str]:
 def placed_point_errors(arm: MonitoredArm, placing: LinearPlacement) -> Array:
     """(m, k, 3) errors where base, targets and what moved are placed [m]."""
     state = placing.state
-    model, _ = arm.fit_near(np.zeros(arm.names.parameter_count, dtype=bool), state)
+    model, _ = arm.fit_parameters_from(np.zeros(arm.names.parameter_count, dtype=bool), state)
     return model.point_errors(state) @ state.rotation.T
 
 
-def correct_for_used_freedom(point_errors: Array, used_coordinates: float) -> Array:
+def inflate_errors_for_placed_coordinates(point_errors: Array, used_coordinates: float) -> Array:
     """Errors (m, k, 3) grown to n / (n - used) in the mean square: what placing took up, put back.
 
     used_coordinates: coordinates, as of `LinearPlacement`.
@@ -263,7 +272,7 @@ def judge_limit_by_errors(
     of.
     """
     grown, group = (
-        correct_for_used_freedom(point_errors, used_coordinates),
+        inflate_errors_for_placed_coordinates(point_errors, used_coordinates),
         group_repeated_poses(data),
     )
     is_rms, required = limit.kind == "rms", 1e-3 * limit.size_mm

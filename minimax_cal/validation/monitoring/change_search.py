@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -49,7 +49,7 @@ def build_session_pair(watched: MonitoredArm, rows: MonitoredRows, column: Array
         [np.full(watched.unmeasured_covariance_root.shape[1], KNOWN_COMPONENT), component]
     )
     new = tuple(new_row_products(watched, rows, random, column))
-    before = tuple(calibration_row_products(watched, old, len(column))) if old else ()
+    before = tuple(calibration_row_products_by_region(watched, old, len(column))) if old else ()
     free = free_parameter_columns(watched, rows).shape[1]
     zero = np.isin(column, watched.zero_parameters)
     near = old.factor if old else np.ones(0)
@@ -85,7 +85,7 @@ def new_row_products(
             yield RowProducts(part.T @ part, int(seen[region == one].sum()), NEW)
 
 
-def calibration_row_products(
+def calibration_row_products_by_region(
     watched: MonitoredArm, old: CalibrationPoses, candidates: int
 ) -> Iterator[RowProducts]:
     """Products of the calibration's rows, region by region."""
@@ -116,7 +116,14 @@ def free_parameter_columns(watched: MonitoredArm, rows: MonitoredRows) -> Array:
     return np.concatenate([before, now], axis=1)
 
 
-def lack_of_fit_columns(watched: MonitoredArm, rows: MonitoredRows) -> tuple[Array, Array]:
+class LackOfFitColumns(NamedTuple):
+    """(N, l) rows by what the model lacks, and (l,) which factors share a variance."""
+
+    columns: Array
+    variance_groups: Array
+
+
+def lack_of_fit_columns(watched: MonitoredArm, rows: MonitoredRows) -> LackOfFitColumns:
     """(N, l) new rows by what the model lacks, and (l,) which factors share a variance."""
     robot, (m, r, n) = watched.cell.robot, rows.arm.shape
     by_angle, turned = lack_of_fit_motions_by_pose(
@@ -125,8 +132,9 @@ def lack_of_fit_columns(watched: MonitoredArm, rows: MonitoredRows) -> tuple[Arr
     links = rows.jacobian[: m * r, : 5 * n].reshape(m, r, 5 * n)
     drift, kind = drift_columns(watched, links, rows.arm, session_times(watched), NEW)
     columns = np.concatenate([by_angle, drift], axis=2).reshape(m * r, -1)
-    return np.pad(columns, ((0, rows.foot_coordinate_count), (0, 0))), np.append(
-        turned[:, 0], n + kind
+    return LackOfFitColumns(
+        np.pad(columns, ((0, rows.foot_coordinate_count), (0, 0))),
+        np.append(turned[:, 0], n + kind),
     )
 
 
@@ -135,9 +143,16 @@ def session_times(watched: MonitoredArm) -> Array | None:
     return session_clock_values(watched.data) if has_session_time(watched.data) else None
 
 
+class DriftColumns(NamedTuple):
+    """(m, r, d) motion by what drifts, and (d,) the kind of each."""
+
+    columns: Array
+    kinds: Array
+
+
 def drift_columns(
     watched: MonitoredArm, links: Array, arm: Array, when: Array | None, source: int
-) -> tuple[Array, Array]:
+) -> DriftColumns:
     """(m, r, d) motion by what drifts in either session and between them, and (d,) the kind.
 
     links: (m, r, 5n) by the link parameters.  The columns are waves of the old session, what is
@@ -146,7 +161,7 @@ def drift_columns(
     robot, old = watched.cell.robot, watched.calibration_poses
     n, (m, r, _) = robot.joints, arm.shape
     if session_times(watched) is None and (old is None or old.when is None):
-        return np.zeros((m, r, 0)), np.zeros(0, dtype=int)
+        return DriftColumns(np.zeros((m, r, 0)), np.zeros(0, dtype=int))
     growth = links[..., : 2 * n] @ robot.mdh[:, :2].T.reshape(-1)
     moved, kind = lack_of_fit_motions_by_time(
         robot, np.zeros(m) if when is None else when, arm, growth
@@ -154,7 +169,7 @@ def drift_columns(
     waves = np.concatenate(list(moved[1:] if when is not None else 0.0 * moved[1:]), axis=2)
     none, apart = 0.0 * waves, moved[0]
     blocks = [none, apart, waves] if source == NEW else [waves, 0.0 * apart, none]
-    return np.concatenate(blocks, axis=2), np.tile(kind, 1 + 2 * MAX_SESSION_WAVES)
+    return DriftColumns(np.concatenate(blocks, axis=2), np.tile(kind, 1 + 2 * MAX_SESSION_WAVES))
 
 
 # ---- what moved ----------------------------------------------------------------------------------
@@ -219,9 +234,16 @@ def joint_name_of_parameter(parameter: str) -> str:
     return "J" + parameter.lstrip("abcdefghijklmnopqrstuvwxyz")
 
 
+class SelectedChange(NamedTuple):
+    """Number of a candidate, and of those that would do nearly as well."""
+
+    candidate: int
+    alternatives: list[int]
+
+
 def select_change(
     explained_squares: Array, is_significant: Array, is_zero: Array
-) -> tuple[int, list[int]]:
+) -> SelectedChange:
     """The one of those that passed that explains most, and which would do nearly as well.
 
     A zero position goes before links that are not clearly better.  explained_squares: (c,) what
@@ -231,7 +253,17 @@ def select_change(
         np.argmax(np.where(is_significant, explained_squares + MIN_LINK_LEAD * is_zero, -np.inf))
     )
     lost = explained_squares[pick] - explained_squares
-    return pick, [int(i) for i in np.argsort(lost) if lost[i] < MAX_ALTERNATIVE_LOSS and i != pick]
+    return SelectedChange(
+        pick, [int(i) for i in np.argsort(lost) if lost[i] < MAX_ALTERNATIVE_LOSS and i != pick]
+    )
+
+
+class ClearestChange(NamedTuple):
+    """A candidate that moved, its p-value, and those that would do nearly as well."""
+
+    candidate: int
+    p_value: float
+    alternatives: list[int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,9 +311,7 @@ class ChangeCandidates:
         _, p_value = student_test(by, sigma, dof)
         return float(np.min(MAX_FALSE_ALARM_PROBABILITY * p_value / self.level, initial=1.0))
 
-    def find_clearest_change(
-        self, both: SessionPair, chosen: Array
-    ) -> tuple[int, float, list[int]] | None:
+    def find_clearest_change(self, both: SessionPair, chosen: Array) -> ClearestChange | None:
         """The one that explains most, its p-value and its rivals; None where all may be chance.
 
         Only one that helps poses it was not estimated from: what mends nothing has not moved.
@@ -304,13 +334,20 @@ class ChangeCandidates:
         square = size**2
         square[chosen] = -np.inf
         pick, near = select_change(square, passed, self.zero)
-        return pick, float(p_value[pick]), near
+        return ClearestChange(pick, float(p_value[pick]), near)
 
 
-def student_test(by: Array, sigma: Array, dof: Array) -> tuple[Array, Array]:
+class StudentTest(NamedTuple):
+    """A change in sigmas, and its p-value."""
+
+    size: Array
+    p_value: Array
+
+
+def student_test(by: Array, sigma: Array, dof: Array) -> StudentTest:
     """How large a change is, in sigmas, and its p-value [Student]."""
     size = np.abs(by) / sigma
-    return np.asarray(size), np.asarray(2.0 * scipy.stats.t.sf(size, dof))
+    return StudentTest(np.asarray(size), np.asarray(2.0 * scipy.stats.t.sf(size, dof)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -358,7 +395,7 @@ def search_changes(watched: MonitoredArm, is_identified: Array) -> ChangeSearch:
         both = both.with_variances_from(build_session_pair(watched, rows, looked.column))
     change, sense = (
         flatten_link_parameters(rows.state.mdh - watched.cell.robot.mdh),
-        file_signs(watched),
+        file_signs_of_link_parameters(watched),
     )
     more, sigma = both.joint_changes(chosen)
     named = tuple(
@@ -377,7 +414,7 @@ def search_changes(watched: MonitoredArm, is_identified: Array) -> ChangeSearch:
     return ChangeSearch(named, first, before, after, looked, looked.p_value_of_no_change(first))
 
 
-def file_signs(watched: MonitoredArm) -> Array:
+def file_signs_of_link_parameters(watched: MonitoredArm) -> Array:
     """(5n,) the sign that a change of each link parameter has in the robot's file."""
     robot = watched.cell.robot
     return flatten_link_parameters(robot.notation.file_value_signs(robot.joints))
@@ -399,12 +436,12 @@ def rows_with_lack_of_fit(
     return replace(rows, latent=np.concatenate([rows.latent, random], axis=1), scale=scale)
 
 
-def with_joint_changes(
+def with_jointly_estimated_changes(
     watched: MonitoredArm, placed: LinearPlacement, found: Sequence[MovedParameter]
 ) -> tuple[MovedParameter, ...]:
     """The same with how far each moved as placed, all of them together, and how sure that is."""
     names = watched.names
-    change = file_signs(watched) * flatten_link_parameters(
+    change = file_signs_of_link_parameters(watched) * flatten_link_parameters(
         placed.state.mdh - watched.cell.robot.mdh
     )
     sigma = np.linalg.norm(

@@ -250,7 +250,14 @@ def check_same_kind_of_arm(first: Fit, second: Fit) -> None:
         )
 
 
-def unobservable_links(fit: Fit) -> tuple[Array, Array]:
+class UnobservableLinks(NamedTuple):
+    """(d,) links that stay as drawn, and (5n, d) what else moves with each."""
+
+    link_indices: Array
+    imitating_motions: Array
+
+
+def unobservable_links(fit: Fit) -> UnobservableLinks:
     """Links to be kept as drawn (d,), and what else moves with each unseen (5n, d).
 
     What base and reflectors imitate on plenty of poses.
@@ -271,7 +278,7 @@ def unobservable_links(fit: Fit) -> tuple[Array, Array]:
     size = np.sqrt(np.maximum(np.diag(gram), MIN_GRAM_DIAGONAL))
     _, vectors = np.linalg.eigh(gram / np.outer(size, size))
     null = vectors[:, : len(gone)] / size[:, None]
-    return gone[gone < n], null[:n, :] @ np.linalg.pinv(null[gone])[:, gone < n]
+    return UnobservableLinks(gone[gone < n], null[:n, :] @ np.linalg.pinv(null[gone])[:, gone < n])
 
 
 def jackknife_covariance_over_regions(fit: Fit) -> Array:
@@ -320,7 +327,14 @@ def list_differences(
         )
 
 
-def find_changed_parameters(first: Fit, second: Fit) -> tuple[tuple[MovedParameter, ...], float]:
+class ChangedParameters(NamedTuple):
+    """Parameters that moved, the clearest first, and the p-value of nothing having moved."""
+
+    changed: tuple[MovedParameter, ...]
+    p_value_of_no_change: float
+
+
+def find_changed_parameters(first: Fit, second: Fit) -> ChangedParameters:
     """What moved from one calibration to the other, the clearest first; p-value of nothing.
 
     The poses of the second are new ones of the first, or the reverse where only that has poses.
@@ -331,8 +345,10 @@ def find_changed_parameters(first: Fit, second: Fit) -> tuple[tuple[MovedParamet
             found = search_changes(
                 watched, match_flags_by_name(fit, watched, fit.identification.active)
             )
-            return tuple(replace(m, by=sign * m.by) for m in found.named), found.same
-    return (), math.nan
+            return ChangedParameters(
+                tuple(replace(m, by=sign * m.by) for m in found.named), found.same
+            )
+    return ChangedParameters((), math.nan)
 
 
 def accuracy_on_common_poses(first: Fit, second: Fit) -> Iterator[PosesAccuracy]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,11 +19,11 @@ from minimax_cal.fitting.uncertainty import Estimator, PosewiseFit
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell, build_measurements_at_rest
 from minimax_cal.modelling.effects.table import effect_parameter_names_and_units
-from minimax_cal.modelling.effects_in_model import extend_model_with_effects
+from minimax_cal.modelling.effects_in_model import ModelAtValues, extend_model_with_effects
 from minimax_cal.modelling.global_start import fit_base_and_targets
-from minimax_cal.modelling.nearby_fit import fit_nearby
+from minimax_cal.modelling.nearby_fit import fit_within_bounds_from_start
 from minimax_cal.modelling.parameters import ParameterNames, ParameterValues, joint_zero_indices
-from minimax_cal.modelling.point_model import PointModel, build_point_model
+from minimax_cal.modelling.point_model import build_point_model
 from minimax_cal.validation.monitoring.calibration_poses import (
     CalibrationPoses,
     build_calibration_poses,
@@ -31,6 +32,13 @@ from minimax_cal.validation.monitoring.calibration_poses import (
 from minimax_cal.validation.monitoring.placing import MonitoredRows
 
 EFFECT_PLACING_PASSES = 3  # passes that place an arm with effects
+
+
+class FootRows(NamedTuple):
+    """Errors of the reflectors on the foot and their slope by the base, by their noise."""
+
+    error: Array
+    jacobian: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +124,7 @@ class MonitoredArm:
         return joint_zero_indices(self.cell.robot.prismatic)
 
     @cached_property
-    def placed_start(self) -> tuple[PointModel, ParameterValues]:
+    def placed_start(self) -> ModelAtValues:
         """The arm as calibrated, where it fits the data best."""
         state = self.cell.parameter_values
         if not self.frame:
@@ -126,9 +134,9 @@ class MonitoredArm:
             state = replace(state, rotation=found.rotation, origin=found.origin)
             if not self.tool:
                 state = replace(state, target_positions=found.target_positions)
-        return self.fit_near(self.is_open, state)
+        return self.fit_parameters_from(self.is_open, state)
 
-    def fit_near(self, active: Array, state: ParameterValues) -> tuple[PointModel, ParameterValues]:
+    def fit_parameters_from(self, active: Array, state: ParameterValues) -> ModelAtValues:
         """Least squares over some parameters from a state that is near, and the model there."""
         terms, robot = self.cell.effects.terms, self.cell.robot
         plain = build_point_model(robot, self.data)
@@ -138,12 +146,12 @@ class MonitoredArm:
                 model, state = extend_model_with_effects(plain, robot, self.data, state, terms)
             model = model.with_active(active)
             if active.any():
-                state = fit_nearby(model, state).x.take(np.array(0))
-        return model, state
+                state = fit_within_bounds_from_start(model, state).x.take(np.array(0))
+        return ModelAtValues(model, state)
 
     def build_rows(self, active: Array, state: ParameterValues) -> MonitoredRows:
         """The errors linear about the best fit with some parameters free, by their noises."""
-        model, state = self.fit_near(active, state)
+        model, state = self.fit_parameters_from(active, state)
         every = model.with_active(np.ones(model.names.parameter_count, dtype=bool))
         poses = PosewiseFit(Estimator(every, np.ones(len(model.y))), state)
         m, r, p = poses.jacobian.shape
@@ -171,7 +179,7 @@ class MonitoredArm:
         n = self.cell.robot.joints
         return slice(5 * n, 5 * n + 6)
 
-    def foot_rows(self, state: ParameterValues) -> tuple[Array, Array]:
+    def foot_rows(self, state: ParameterValues) -> FootRows:
         """What the reflectors on the foot say of the base, in units of their noise: errors, slope.
 
         Each is a mean of then and a mean of now.
@@ -184,4 +192,4 @@ class MonitoredArm:
         slope[..., 5 * n : 5 * n + 3] = np.eye(3)
         turned = np.cross(np.eye(3)[None], self.foot[:, None])  # (f, turn, 3)
         slope[..., 5 * n + 3 : 5 * n + 6] = np.swapaxes(turned, 1, 2)
-        return error, slope.reshape(3 * f, -1) / np.sqrt(self.foot_variance)
+        return FootRows(error, slope.reshape(3 * f, -1) / np.sqrt(self.foot_variance))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,9 +26,14 @@ NO_REFLECTORS = np.zeros((0, 3))  # no reflector on the foot
 MIN_NOISE_OF_COORDINATE = 1e-9  # of a coordinate: data that were computed, not measured [m]
 
 
-def open_monitored_arm(
-    fit: Fit, data: Measurements, known_parts: Sequence[str]
-) -> tuple[MonitoredArm, tuple[str, ...]]:
+class OpenedArm(NamedTuple):
+    """New measurements beside their calibration, and notices on what was left out."""
+
+    arm: MonitoredArm
+    notices: tuple[str, ...]
+
+
+def open_monitored_arm(fit: Fit, data: Measurements, known_parts: Sequence[str]) -> OpenedArm:
     """The new measurements beside the calibration; what was left out.  Raises CalibrationError."""
     data = check_and_complete_joints(fit.cell.robot, data)
     if len(np.unique(session_labels(data))) > 1:
@@ -82,11 +88,21 @@ def open_monitored_arm(
         foot_variance=2.0 * variance + scatter,
     )
     if not gone:
-        return watched, ()
-    return watched, (f"left out: {', '.join(gone)}; they ended with the calibration's session",)
+        return OpenedArm(watched, ())
+    return OpenedArm(
+        watched, (f"left out: {', '.join(gone)}; they ended with the calibration's session",)
+    )
 
 
-def measure_foot_motion(fit: Fit, data: Measurements) -> tuple[Array, Array, float]:
+class FootMotion(NamedTuple):
+    """Reflectors (f, 3) on the foot as calibrated and as seen now [m], and their variance [m^2]."""
+
+    before: Array
+    now: Array
+    variance: float
+
+
+def measure_foot_motion(fit: Fit, data: Measurements) -> FootMotion:
     """Reflectors on the foot that both saw: where they stood, where they stand, their scatter.
 
     Returns (f, 3) in the base as calibrated, (f, 3) as seen now [m], none where they are too few to
@@ -96,14 +112,14 @@ def measure_foot_motion(fit: Fit, data: Measurements) -> tuple[Array, Array, flo
     then, now = read_foot_reflectors(fit.data), read_foot_reflectors(data)
     both = [name for name in now if name in then]
     if len(both) < MIN_FOOT_REFLECTORS:
-        return NO_REFLECTORS, NO_REFLECTORS, 0.0
+        return FootMotion(NO_REFLECTORS, NO_REFLECTORS, 0.0)
     base, label = np.linalg.inv(fit.cell.base), cluster_joint_regions(fit.data)
     means = {name: np.nanmean(then[name], axis=0) for name in both}
     old = np.array([base[:3, :3] @ means[name] + base[:3, 3] for name in both])
     deviation = np.stack([then[name] - means[name] for name in both])
     regional = [np.nanmean(deviation[:, label == one], axis=1) ** 2 for one in np.unique(label)]
     within = float(np.nanmean(deviation**2)) / data.poses
-    return (
+    return FootMotion(
         old,
         np.array([np.nanmean(now[name], axis=0) for name in both]),
         max(float(np.nanmean(regional)), within),

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -50,6 +51,21 @@ class SessionVariances:
     factor: Array
     dof: float
     deviance: float
+
+
+class CandidateScores(NamedTuple):
+    """(c,) change of each candidate, its sigma, and its degrees of freedom."""
+
+    change: Array
+    sigma: Array
+    dof: Array
+
+
+class JointChanges(NamedTuple):
+    """(d,) changes of some candidates, all together, and their sigmas."""
+
+    change: Array
+    sigma: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +134,7 @@ class SessionPair:
             - across.T @ solve_semidefinite(gram, across)
         )
 
-    def candidate_scores(self, chosen: Array) -> tuple[Array, Array, Array]:
+    def candidate_scores(self, chosen: Array) -> CandidateScores:
         """Each candidate's change beside chosen ones, its sigma, its degrees of freedom: (c,) each.
 
         The variance is part noise, of many degrees of freedom, and part of what the model lacks,
@@ -132,7 +148,7 @@ class SessionPair:
         by_noise = np.minimum(size / noise, 1.0)  # share of the variance
         places = max(sum(part.source != FOOT for part in self.parts) - 1, 1)
         dof = 1.0 / (by_noise**2 / self.variances.dof + (1.0 - by_noise) ** 2 / places)
-        return every[:-1, -1] / size, 1.0 / np.sqrt(size), dof
+        return CandidateScores(every[:-1, -1] / size, 1.0 / np.sqrt(size), dof)
 
     def is_known(self, fitted: Array) -> Array:
         """(f,) True for columns that are not what the model lacks."""
@@ -194,7 +210,7 @@ class SessionPair:
         pull = own[fitted, -1]
         return float(own[-1, -1] - 2.0 * step @ pull + step @ own[np.ix_(fitted, fitted)] @ step)
 
-    def joint_changes(self, chosen: Array) -> tuple[Array, Array]:
+    def joint_changes(self, chosen: Array) -> JointChanges:
         """(d,) of chosen candidates, all of them together, and (d,) sigmas."""
         fitted = self.select_fitted_columns(chosen)
         gram = self.estimated_products[np.ix_(fitted, fitted)] + np.diag(
@@ -204,7 +220,7 @@ class SessionPair:
         found = solve_semidefinite(gram, right)
         variance = np.maximum(np.diag(found[:, 1:]), 0.0)
         at = np.arange(len(fitted) - len(chosen), len(fitted))
-        return found[at, 0], np.sqrt(variance[at])
+        return JointChanges(found[at, 0], np.sqrt(variance[at]))
 
     def shift_by_lack_of_fit(self) -> Array:
         """(free, random) by how much u moved the x of the calibration: minus its share of it."""
