@@ -63,7 +63,7 @@ from minimax_cal.measuring.pose_groups import (
 )
 from minimax_cal.measuring.session_frames import convert_to_first_frame
 from minimax_cal.measuring.set_aside_points import set_points_aside
-from minimax_cal.measuring.visit_history import add_history_columns, list_time_notices
+from minimax_cal.measuring.visit_history import add_history_columns, list_backward_time_notices
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.effects.time_effects import SESSION_JUMP
 from minimax_cal.modelling.global_start import NO_BASE_ROTATION
@@ -256,7 +256,7 @@ def split_data(robot: Robot, data: Measurements, options: Options) -> DataSplit:
     # Faults that show without a fit: of joints, clocks and names, distances, noise.
     doubts = (
         *measurement_checks.list_robot_notices(robot, data),
-        *list_time_notices(data),
+        *list_backward_time_notices(data),
         describe_mislabelled_pose(data),
     )
     faults = tuple(

@@ -29,7 +29,7 @@ from minimax_cal.measuring.file_mistakes import (
     format_leave_out_command,
     format_mend_command,
     propose_file_corrections,
-    with_points_shifted_by_rows,
+    with_points_from_rows_ahead,
 )
 from minimax_cal.measuring.measurement_checks import (
     check_joints_move,
@@ -276,7 +276,7 @@ def find_best_break(
     """
     moved = np.zeros(data.poses)
     moved[slice(None, -shift) if shift > 0 else slice(-shift, None)] = misses(
-        robot, with_points_shifted_by_rows(data, shift), state
+        robot, with_points_from_rows_ahead(data, shift), state
     )
     one, other = (moved, own) if is_shifted_before else (own, moved)
     gap = abs(shift)  # rows at the break whose own points are lost

@@ -20,12 +20,18 @@ import numpy as np
 from minimax_cal.core.arrays import Array
 from minimax_cal.instruments.camera_model import (
     FITTED_INTRINSICS,
-    pixels_and_derivatives,
+    pixel_derivatives,
     project_to_pixels,
 )
-from minimax_cal.instruments.instrument import NOT_READY, Instrument, Words, build_random_poses
+from minimax_cal.instruments.instrument import (
+    NOT_READY,
+    FramePose,
+    Instrument,
+    Words,
+    build_random_poses,
+)
 from minimax_cal.instruments.pixel_data import PixelData
-from minimax_cal.instruments.protocol import NO_PART, FlangePoses, ResidualRows
+from minimax_cal.instruments.protocol import NO_PART, FlangePoses, ReducedRows, ResidualRows
 from minimax_cal.measuring.pose_groups import group_repeated_poses
 from minimax_cal.robots.kinematics import (
     rotation_from_vector,
@@ -61,6 +67,21 @@ class TargetView(NamedTuple):
     point: Array
     axes: Array
     view: Array
+
+
+class CameraImagesStart(NamedTuple):
+    """Images of cameras, and start values (e,) of their unknowns."""
+
+    images: CameraImages
+    unknowns: Array
+
+
+class ErrorsWithSlopes(NamedTuple):
+    """Errors (r, N), their slopes (r, N, 3) by targets in the cameras, and (9, r, N) by lenses."""
+
+    errors: Array
+    slopes_by_target: Array
+    slopes_by_lens: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +142,7 @@ class CameraImages(Instrument):
         target_points: Array,
         *,
         on_flange: bool,
-    ) -> tuple[CameraImages, Array]:
+    ) -> CameraImagesStart:
         """All pixels of the data, alike, and the own parameters; turns are counted from here.
 
         camera_poses: (c, 4, 4), board_pose: (4, 4) poses, or target_points: (k, 3) targets of
@@ -136,7 +157,9 @@ class CameraImages(Instrument):
             one.intrinsic[:, :LENS_PARAMETER_COUNT],
         )
         six = np.pad(every[:, :3, 3], ((0, 0), (0, 3)))
-        return one, np.concatenate([part.reshape(-1) for part in (six, spots, lens)])
+        return CameraImagesStart(
+            one, np.concatenate([part.reshape(-1) for part in (six, spots, lens)])
+        )
 
     # ---- what was measured -------------------------------------------------------------------
 
@@ -224,10 +247,10 @@ class CameraImages(Instrument):
             -1, LENS_PARAMETER_COUNT
         )
 
-    def camera_and_board_frames(self, unknowns: Array) -> tuple[Array, Array]:
+    def camera_and_board_frames(self, unknowns: Array) -> FramePose:
         """Rotations and origins of cameras and board in what they are fixed to [m]."""
         six = unknowns[: 6 * len(self.turn)].reshape(-1, 6)
-        return self.turn @ rotation_from_vector(six[:, 3:]), six[:, :3]
+        return FramePose(self.turn @ rotation_from_vector(six[:, 3:]), six[:, :3])
 
     def target_positions(self, unknowns: Array) -> Array:
         """(k, 3) targets in the base or in the flange [m]."""
@@ -287,7 +310,7 @@ class CameraImages(Instrument):
         """(N,) of the targets in the cameras [m]."""
         return self.view_targets(arm, unknowns).point[:, 2]
 
-    def errors_and_slopes(self, seen: TargetView, unknowns: Array) -> tuple[Array, Array, Array]:
+    def errors_and_slopes(self, seen: TargetView, unknowns: Array) -> ErrorsWithSlopes:
         """Errors (r, N), their slopes (r, N, 3) by the targets in the cameras, (9, r, N) by lens.
 
         Of pixels, of lengths at given depths, or of directions.
@@ -297,22 +320,24 @@ class CameraImages(Instrument):
             size = np.linalg.norm(point, axis=1)
             unit = (point.T / size)[..., None]
             by = (np.eye(3)[:, None] - unit * unit[..., 0].T) / size[:, None]
-            return np.zeros(by.shape[:2]), by, np.zeros((LENS_PARAMETER_COUNT, *by.shape[:2]))
+            return ErrorsWithSlopes(
+                np.zeros(by.shape[:2]), by, np.zeros((LENS_PARAMETER_COUNT, *by.shape[:2]))
+            )
         if self.sight is not None:
             focal = self.intrinsic[self.pixels.camera, :2].T / self.sight.depth
             by = np.tile(np.eye(2, 3)[:, None], (1, len(point), 1))
             by[..., 2] = -self.sight.direction
             by *= focal[..., None]
-            return (
+            return ErrorsWithSlopes(
                 -np.einsum("rnp,np->rn", by, point),
                 by,
                 np.zeros((LENS_PARAMETER_COUNT, *focal.shape)),
             )
         flat = point[:, :2] / point[:, 2:]
-        pixel, across, lens = pixels_and_derivatives(self.intrinsics_of_pixels(unknowns), *flat.T)
+        pixel, across, lens = pixel_derivatives(self.intrinsics_of_pixels(unknowns), *flat.T)
         across = np.moveaxis(across, 0, -1) / point[:, 2:]  # by the plane at depth one
         by = np.concatenate([across, -(across * flat).sum(axis=2, keepdims=True)], axis=2)
-        return self.pixels.pixel.T - pixel, by, lens
+        return ErrorsWithSlopes(self.pixels.pixel.T - pixel, by, lens)
 
     def read(self, arm: FlangePoses, unknowns: Array) -> ResidualRows:
         """Errors of pixels, then of the lenses."""
@@ -364,7 +389,7 @@ class CameraImages(Instrument):
             ),
         )
 
-    def lens_prior_rows(self, unknowns: Array) -> tuple[Array, Array]:
+    def lens_prior_rows(self, unknowns: Array) -> ReducedRows:
         """What the lenses differ from their files, by their doubts, as heavy as pixels: (l,).
 
         And its derivative, (e, l).
@@ -372,10 +397,12 @@ class CameraImages(Instrument):
         count = self.lens_row_count
         rows = np.zeros((len(unknowns), count))
         if not count:
-            return np.zeros(0), rows
+            return ReducedRows(np.zeros(0), rows)
         by = (1.0 if self.bearings else self.metre * self.noise) / self.doubt.reshape(-1)
         rows[-count:] = np.diag(by)
-        return (self.intrinsic[:, :LENS_PARAMETER_COUNT].reshape(-1) - unknowns[-count:]) * by, rows
+        return ReducedRows(
+            (self.intrinsic[:, :LENS_PARAMETER_COUNT].reshape(-1) - unknowns[-count:]) * by, rows
+        )
 
     def at_random_poses(self, robot: Robot, unknowns: Array) -> CameraImages:
         """Directions to the targets from every camera at plenty of poses; to some of a board."""

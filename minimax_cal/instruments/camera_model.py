@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -76,7 +76,15 @@ def project_to_pixels(intrinsic: Array, x: Array, y: Array) -> Array:
     return np.stack([fx * u + cx, fy * v + cy], axis=-2)
 
 
-def pixels_and_derivatives(intrinsic: Array, x: Array, y: Array) -> tuple[Array, Array, Array]:
+class PixelDerivatives(NamedTuple):
+    """Pixels (2, N), derivatives (2, 2, N) by directions and (9, 2, N) by `FITTED_INTRINSICS`."""
+
+    pixels: Array
+    by_direction: Array
+    by_intrinsics: Array
+
+
+def pixel_derivatives(intrinsic: Array, x: Array, y: Array) -> PixelDerivatives:
     """Pixels (2, N), and their derivatives by x, y (2, 2, N) and by `FITTED_INTRINSICS` (9, 2, N).
 
     intrinsic: (16, N) or (16, 1).  The first axis of a derivative is what it is taken by.
@@ -119,7 +127,7 @@ def pixels_and_derivatives(intrinsic: Array, x: Array, y: Array) -> tuple[Array,
             focal * here * s**3,
         ]
     )
-    return pixel, np.stack([focal * by_x, focal * by_y]), own
+    return PixelDerivatives(pixel, np.stack([focal * by_x, focal * by_y]), own)
 
 
 def undistort_pixels(intrinsic: Array, pixels: Array) -> Array:
@@ -132,7 +140,7 @@ def undistort_pixels(intrinsic: Array, pixels: Array) -> Array:
     centre = np.stack(np.broadcast_arrays(*intrinsic[2:4]))
     place = (pixels - centre) / focal
     for _ in range(MAX_UNDISTORTION_STEPS):
-        at, by, _ = pixels_and_derivatives(intrinsic, *place)
+        at, by, _ = pixel_derivatives(intrinsic, *place)
         step = np.linalg.solve(np.moveaxis(by, -1, 0).swapaxes(1, 2), (pixels - at).T[..., None])
         step = np.clip(step[..., 0].T, -0.5, 0.5)
         place = np.clip(place + step, -MAX_DIRECTION_TANGENT, MAX_DIRECTION_TANGENT)
@@ -180,7 +188,14 @@ def read_camera_file(camera_name: str, path: Path | str) -> Camera:
     )
 
 
-def parse_image_size(path: Path | str, content: Mapping[str, Any]) -> tuple[int, int]:
+class ImageSize(NamedTuple):
+    """Width and height of an image [px], 0 where unknown."""
+
+    width: int
+    height: int
+
+
+def parse_image_size(path: Path | str, content: Mapping[str, Any]) -> ImageSize:
     """Width and height of the image, 0 where the file does not tell.  Raises DataError."""
     out = []
     for key in ("width", "height"):
@@ -188,7 +203,7 @@ def parse_image_size(path: Path | str, content: Mapping[str, Any]) -> tuple[int,
         if given and (not isinstance(given[0], int) or given[0] <= 0):
             raise DataError(f"{path}: image_{key} {given[0]!r} is no number of pixels")
         out.append(int(given[0]) if given else 0)
-    return out[0], out[1]
+    return ImageSize(out[0], out[1])
 
 
 def parse_distortion_coefficients(path: Path | str, content: Mapping[str, Any]) -> Array:

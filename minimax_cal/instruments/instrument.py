@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self, TypeVar
+from typing import Any, ClassVar, NamedTuple, Self, TypeVar
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from minimax_cal.core.errors import DataError
 from minimax_cal.instruments.instrument_options import InstrumentOptions
 from minimax_cal.instruments.protocol import FlangePoses, ResidualRows
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.measuring.pose_groups import group_repeated_poses, select_holdout_rows
+from minimax_cal.measuring.pose_groups import HoldoutMask, group_repeated_poses, select_holdout_rows
 from minimax_cal.modelling.point_model import DEFAULT_TARGET_NAME
 from minimax_cal.reading.measurement_table import MeasurementTable
 from minimax_cal.robots.joint_sampling import random_joint_values
@@ -86,6 +86,27 @@ class Words:
     of_position: bool = False
     whole: str = ""
     fitted: str = "a base is"
+
+
+class NumberCounts(NamedTuple):
+    """How many numbers are behind the errors of training and of held-out rows."""
+
+    train: int
+    holdout: int
+
+
+class FramePose(NamedTuple):
+    """Rotations (..., 3, 3) and origins (..., 3) of frames in another [m]."""
+
+    rotation: Array
+    origin: Array
+
+
+class NoticeAndMend(NamedTuple):
+    """A notice to the user, and what mends it; both '' for none."""
+
+    notice: str
+    mend: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,10 +207,11 @@ class Instrument:
         _, first = np.unique(group_repeated_poses(self.at), return_index=True)
         return int(self.numbers_per_pose[first].sum())
 
-    def count_train_and_holdout_numbers(self, holdout_mask: Array) -> tuple[int, int]:
+    def count_train_and_holdout_numbers(self, holdout_mask: Array) -> NumberCounts:
         """Numbers behind the errors of training and held-out rows.  holdout_mask: (m,)."""
-        return int(self.numbers_per_pose[~holdout_mask].sum()), int(
-            self.numbers_per_pose[holdout_mask].sum()
+        return NumberCounts(
+            int(self.numbers_per_pose[~holdout_mask].sum()),
+            int(self.numbers_per_pose[holdout_mask].sum()),
         )
 
     def check_data(self) -> None:
@@ -228,7 +250,7 @@ class Instrument:
         """Where a row stands, for a message."""
         return f"{self.at.source}:{self.at.line[row]}"
 
-    def holdout_rows_and_notices(self, options: InstrumentOptions) -> tuple[Array, tuple[str, ...]]:
+    def holdout_rows_and_notices(self, options: InstrumentOptions) -> HoldoutMask:
         """(m,) True where a row is held out; notices."""
         return select_holdout_rows(self.at, options.holdout, options.seed)
 
@@ -289,9 +311,9 @@ class Instrument:
         """(e',) unknowns of `single_point_instrument`, by its own."""
         raise NotImplementedError
 
-    def base_rotation_and_origin(self, unknowns: Array) -> tuple[Array, Array]:
+    def base_rotation_and_origin(self, unknowns: Array) -> FramePose:
         """Rotation (3, 3) and origin (3,) of the robot's base in its frame [m]."""
-        return np.eye(3), np.zeros(3)
+        return FramePose(np.eye(3), np.zeros(3))
 
     def flange_points(self, unknowns: Array) -> Array:
         """(k, 3) points on the flange, its origin where it has none of its own [m]."""
@@ -389,11 +411,11 @@ class Instrument:
         """Options that would fit more of it."""
         return {}
 
-    def describe_wider_fit(self, noise_before: float, noise_after: float) -> tuple[str, str]:
+    def describe_wider_fit(self, noise_before: float, noise_after: float) -> NoticeAndMend:
         """What to say, and the mend, where `options_for_more_parameters` explains most.  Noises
         [m].
         """
-        return "", ""
+        return NoticeAndMend("", "")
 
 
 D = TypeVar("D", bound=Instrument)

@@ -8,6 +8,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -192,7 +193,14 @@ def number_names_in_column(
     return out
 
 
-def read_labelled_joints(path: Path | str) -> tuple[Measurements, tuple[str, ...]]:
+class LabelledJoints(NamedTuple):
+    """Joint values by pose, and the poses' names."""
+
+    data: Measurements
+    labels: tuple[str, ...]
+
+
+def read_labelled_joints(path: Path | str) -> LabelledJoints:
     """Joint values by pose, and the poses' names.  Raises DataError."""
     file = read_measurement_table(path)
     at = build_joint_measurements(file, POSE_COLUMN_PATTERN)
@@ -206,7 +214,7 @@ def read_labelled_joints(path: Path | str) -> tuple[Measurements, tuple[str, ...
             raise DataError(
                 f"{path}:{file.line[row]}: pose {label[:60]!r} stands on line {first} too"
             )
-    return at, labels
+    return LabelledJoints(at, labels)
 
 
 def read_board_targets(path: Path | str) -> dict[str, Array]:

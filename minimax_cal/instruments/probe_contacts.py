@@ -11,7 +11,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -53,6 +53,14 @@ MIN_CONTACTS_BY_KIND = {
 }  # one more than the surface itself has unknowns
 RANDOM_CONTACTS_PER_SURFACE = 300  # contacts that show what no contacts could tell
 MAX_GIVEN_RADIUS_SQUARES_RATIO = 4.0  # times the mean square of a sphere whose radius is free
+
+
+class SurfaceGaps(NamedTuple):
+    """Normals (m, 3) of a surface, gaps (m,) [m], and their slopes (m, s) by the surface."""
+
+    normals: Array
+    gaps: Array
+    slopes: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +199,7 @@ class SurfaceContacts(Instrument):
 
     def normals_gaps_and_slopes(
         self, ball_centres: Array, surface_index: int, unknowns: Array
-    ) -> tuple[Array, Array, Array]:
+    ) -> SurfaceGaps:
         """Normal (m, 3) where p lies, its gap (m,), slopes by the surface's own (m, ..).
 
         ball_centres: (m, 3) of the ball's centre [m].  surface_index: which surface.
@@ -214,7 +222,7 @@ class SurfaceContacts(Instrument):
             normal, distance = np.broadcast_to(n, ball_centres.shape), ball_centres @ n
             slopes = [ball_centres @ tilt for tilt in tilts]
         gap = distance - values[-1] - unknowns[-1]
-        return normal, gap, np.column_stack([*slopes, -np.ones(len(ball_centres))])
+        return SurfaceGaps(normal, gap, np.column_stack([*slopes, -np.ones(len(ball_centres))]))
 
     def slopes_by_body_pose(
         self, ball_centres: Array, surface_index: int, unknowns: Array

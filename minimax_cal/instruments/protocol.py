@@ -44,6 +44,13 @@ class FlangePoses(NamedTuple):
         return np.asarray(turned + (self.origin if spot.ndim == 1 else self.origin[:, None]))
 
 
+class ReducedRows(NamedTuple):
+    """Residuals (r,), and their slopes (p, r) by parameters."""
+
+    residuals: Array
+    slopes: Array
+
+
 class ResidualRows(NamedTuple):
     """r rows: measured minus predicted, and the slopes of the prediction.
 
@@ -89,7 +96,7 @@ class ResidualRows(NamedTuple):
 
     def eliminate_places_and_add_sums(
         self, slopes: Array, *, keep_slopes: bool = False, row_weights: Array = NO_ROW_NUMBERS
-    ) -> tuple[Array, Array]:
+    ) -> ReducedRows:
         """Residuals (r + c,) and slopes (p, r + c), places eliminated and sums made.
 
         slopes: (p, r) of the rows.  keep_slopes: whether slopes leave the places where they are.
@@ -97,11 +104,11 @@ class ResidualRows(NamedTuple):
         """
         error = self.residual
         if not len(self.about):
-            return error, slopes
+            return ReducedRows(error, slopes)
         short, more = self.short, slopes @ self.sums.T if len(self.sums) else slopes[:, :0]
         error = self.subtract_place_means(error, row_weights)
         slopes = slopes if keep_slopes else self.subtract_place_means(slopes, row_weights)
-        return np.concatenate([error, short]), np.concatenate([slopes, more], axis=1)
+        return ReducedRows(np.concatenate([error, short]), np.concatenate([slopes, more], axis=1))
 
     def subtract_place_means(self, values: Array, row_weights: Array = NO_ROW_NUMBERS) -> Array:
         """Values (..., r) without the mean of those about the same place.  row_weights: as

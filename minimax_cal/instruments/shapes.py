@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 import scipy
 
 from minimax_cal.core.arrays import Array
-from minimax_cal.instruments.instrument import SPOT, scaled_least_squares, spots_aside
+from minimax_cal.instruments.instrument import SPOT, FramePose, scaled_least_squares, spots_aside
 from minimax_cal.instruments.protocol import FlangePoses
 from minimax_cal.instruments.wires import solve_linear_target
 from minimax_cal.robots.kinematics import rotation_from_vector
@@ -53,6 +54,14 @@ class Surface:
         return ("offset",) if self.is_face else ("tilt1", "tilt2", "offset")
 
 
+class PlaneNormal(NamedTuple):
+    """Normal (3,) of a plane, and its derivatives (3,) by the two tilts."""
+
+    normal: Array
+    by_first_tilt: Array
+    by_second_tilt: Array
+
+
 @dataclass(frozen=True, eq=False)
 class SurfaceParameters:
     """Which surfaces there are, and where their parameters stand among the instrument's own.
@@ -87,33 +96,45 @@ class SurfaceParameters:
         ends = 3 + np.cumsum([0, *(len(s.parameter_endings) for s in self.surfaces)])
         return [slice(int(a), int(b)) for a, b in pairwise(ends)]
 
-    def body_rotation_and_origin(self, unknowns: Array) -> tuple[Array, Array]:
+    def body_rotation_and_origin(self, unknowns: Array) -> FramePose:
         """Rotation (3, 3) and origin (3,) of the body."""
-        return self.turn @ rotation_from_vector(unknowns[-4:-1]), unknowns[-7:-4]
+        return FramePose(self.turn @ rotation_from_vector(unknowns[-4:-1]), unknowns[-7:-4])
 
-    def plane_normal_and_derivatives(
-        self, surface_index: int, unknowns: Array
-    ) -> tuple[Array, Array, Array]:
+    def plane_normal_and_derivatives(self, surface_index: int, unknowns: Array) -> PlaneNormal:
         """Normal (3,) of a plane, and its derivatives by the two tilts."""
         n0, u, v = self.axes[surface_index]
         a, b, _ = unknowns[self.surface_slices()[surface_index]]
         size = np.sqrt(1.0 + a**2 + b**2)
         n = (n0 + a * u + b * v) / size
         one, other = ((w - n * (n @ w)) / size for w in (u, v))
-        return n, one, other
+        return PlaneNormal(n, one, other)
 
 
 # ---- a start without a guess -------------------------------------------------------------------
 
 
-def fit_plane(points: Array) -> tuple[Array, float]:
+class FittedPlane(NamedTuple):
+    """Unit normal (3,) of a plane, and its distance from the origin [m]."""
+
+    normal: Array
+    offset: float
+
+
+def fit_plane(points: Array) -> FittedPlane:
     """Normal (3,) and offset of the plane that points (m, 3) lie on best [m]."""
     centre = points.mean(axis=0)
     normal = np.linalg.svd(points - centre, full_matrices=False)[2][-1]
-    return normal, float(normal @ centre)
+    return FittedPlane(normal, float(normal @ centre))
 
 
-def fit_sphere(points: Array, given_radius: float) -> tuple[Array, float]:
+class FittedSphere(NamedTuple):
+    """Centre (3,) and radius of a sphere [m]."""
+
+    centre: Array
+    radius: float
+
+
+def fit_sphere(points: Array, given_radius: float) -> FittedSphere:
     """Centre (3,) and radius of the sphere that points (m, 3) lie on best [m].
 
     Algebraic, |p|^2 = 2 p.C + k, then by distances.  given_radius: given, or NaN.
@@ -129,14 +150,14 @@ def fit_sphere(points: Array, given_radius: float) -> tuple[Array, float]:
         columns = [-off / distance[:, None], np.full((len(q), int(np.isnan(given_radius))), -1.0)]
         step = scaled_least_squares(np.concatenate(columns, axis=1), size - distance)
         centre, size = centre + step[:3], size + float(step[3:].sum())
-    return middle + centre, size
+    return FittedSphere(middle + centre, size)
 
 
 def fit_surfaces_to_ball_centres(
     ball_centres: Array, surfaces: Sequence[Surface], ball_radius: float, touched_surface: Array
-) -> list[tuple[Array, float]]:
+) -> list[FittedPlane | FittedSphere]:
     """The best plane or sphere through the ball's centres p (m, 3) of each surface."""
-    out = []
+    out: list[FittedPlane | FittedSphere] = []
     for at, surface in enumerate(surfaces):
         here = ball_centres[touched_surface == at]
         out.append(
@@ -170,16 +191,23 @@ def find_linear_ball_positions(
     return [spot for spot in out if np.isfinite(spot).all()]
 
 
+class SurfaceStart(NamedTuple):
+    """The parameters of surfaces, and start values (e,) of them."""
+
+    parameters: SurfaceParameters
+    unknowns: Array
+
+
 def fit_ball_and_surfaces(
     arm: FlangePoses, surfaces: tuple[Surface, ...], ball_radius: float, touched_surface: Array
-) -> tuple[SurfaceParameters, Array]:
+) -> SurfaceStart:
     """Where ball and surfaces fit the arm as drawn best, and their values.
 
     For a given place of the ball on the flange each surface is found in closed form, which leaves
     three unknowns: least squares from several places.
     """
 
-    def found(spot: Array) -> tuple[Array, list[tuple[Array, float]]]:
+    def found(spot: Array) -> tuple[Array, list[FittedPlane | FittedSphere]]:
         p = arm.place(spot)
         return p, fit_surfaces_to_ball_centres(p, surfaces, ball_radius, touched_surface)
 
@@ -210,11 +238,11 @@ def fit_ball_and_surfaces(
 def build_surface_unknowns(
     ball_position: Array,
     ball_centres: Array,
-    fitted_surfaces: list[tuple[Array, float]],
+    fitted_surfaces: list[FittedPlane | FittedSphere],
     surfaces: tuple[Surface, ...],
     ball_radius: float,
     touched_surface: Array,
-) -> tuple[SurfaceParameters, Array]:
+) -> SurfaceStart:
     """The surfaces found, as a block's shapes and values.  ball_centres: (m, 3) of the ball's
     centre [m].
     """
@@ -242,16 +270,24 @@ def build_surface_unknowns(
             own[slot] = [*place, radius_here]
         else:
             own[slot] = [0.0, 0.0, size - radius]
-    return shapes, own
+    return SurfaceStart(shapes, own)
+
+
+class FittedBody(NamedTuple):
+    """Rotation (3, 3) and origin (3,) of a body, and the radius of the ball [m]."""
+
+    rotation: Array
+    origin: Array
+    ball_radius: float
 
 
 def fit_body_and_ball_radius(
     ball_centres: Array,
-    fitted_surfaces: list[tuple[Array, float]],
+    fitted_surfaces: list[FittedPlane | FittedSphere],
     surfaces: tuple[Surface, ...],
     ball_radius: float,
     touched_surface: Array,
-) -> tuple[Array, Array, float]:
+) -> FittedBody:
     """Rotation (3, 3) and origin (3,) of the body by its faces, and the radius of the ball [m].
 
     The ball touches from outside, so that the other contacts with the body lie inwards.
@@ -262,7 +298,7 @@ def fit_body_and_ball_radius(
                if s.kind == SPHERE_KIND and np.isfinite(s.size)]  # fmt: skip
     radius = float(np.mean(spheres)) if spheres and not np.isfinite(ball_radius) else radius
     if not faces:
-        return np.eye(3), np.zeros(3), radius
+        return FittedBody(np.eye(3), np.zeros(3), radius)
     middle = ball_centres[np.isin(touched_surface, faces)].mean(axis=0)
     outward = []
     for at in faces:
@@ -282,9 +318,11 @@ def fit_body_and_ball_radius(
         ball_radius if np.isfinite(ball_radius) else 0.0
     )
     if not known:
-        return turn, middle, radius
+        return FittedBody(turn, middle, radius)
     found = solve_body_origin_and_radius(rows, reached - sizes, middle)
-    return turn, found[:3], float(found[3]) if np.isnan(ball_radius) and len(known) > 3 else radius
+    return FittedBody(
+        turn, found[:3], float(found[3]) if np.isnan(ball_radius) and len(known) > 3 else radius
+    )
 
 
 def solve_body_origin_and_radius(rows: Array, offsets: Array, contact_middle: Array) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 
@@ -68,9 +69,17 @@ def check_shape_and_finite(
         raise DataError(f"{instrument.kind}: {name} is not finite")
 
 
+class SlopeComparison(NamedTuple):
+    """A parameter's name, slopes (r,) as the instrument has them and by central differences."""
+
+    name: str
+    slopes: Array
+    differences: Array
+
+
 def list_slope_comparisons(
     instrument: Instrument, arm: FlangePoses, unknowns: Array, rows: ResidualRows
-) -> Iterator[tuple[str, Array, Array]]:
+) -> Iterator[SlopeComparison]:
     """Name, slopes (r,) as the instrument says them and by central differences."""
 
     def slope(ahead: ResidualRows, behind: ResidualRows) -> Array:
@@ -80,14 +89,16 @@ def list_slope_comparisons(
         instrument.names, DIFFERENCE_STEP * np.eye(len(unknowns)), rows.by_own.T, strict=True
     ):
         ends = (instrument.read(arm, unknowns + step), instrument.read(arm, unknowns - step))
-        yield f"by_own for {name}", said, slope(*ends)
+        yield SlopeComparison(f"by_own for {name}", said, slope(*ends))
     by_turn = slopes_by_flange_rotation(arm, rows)
     for i, axis in enumerate("xyz"):
         step = DIFFERENCE_STEP * np.eye(3)[i]
         moved = [
             instrument.read(arm._replace(origin=arm.origin + s * step), unknowns) for s in (1, -1)
         ]
-        yield f"by_point along {axis}", rows.by_point[:, i], slope(*moved)
+        yield SlopeComparison(f"by_point along {axis}", rows.by_point[:, i], slope(*moved))
         turns = [rotation_from_vector(s * step) @ arm.rotation for s in (1, -1)]
         turned = [instrument.read(arm._replace(rotation=turn), unknowns) for turn in turns]
-        yield f"by_point and by_rotation about {axis}", by_turn[:, i], slope(*turned)
+        yield SlopeComparison(
+            f"by_point and by_rotation about {axis}", by_turn[:, i], slope(*turned)
+        )

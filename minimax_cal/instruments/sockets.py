@@ -19,6 +19,7 @@ from minimax_cal.instruments.instrument import (
     FitNominalArm,
     Instrument,
     InstrumentColumns,
+    NumberCounts,
     Words,
     bare,
     check_instrument_data,
@@ -37,7 +38,7 @@ from minimax_cal.instruments.protocol import (
     ResidualRows,
 )
 from minimax_cal.measuring.measurements import MAX_POINT_DISTANCE, build_joint_measurements
-from minimax_cal.measuring.pose_groups import group_repeated_poses, select_holdout_rows
+from minimax_cal.measuring.pose_groups import HoldoutMask, group_repeated_poses, select_holdout_rows
 from minimax_cal.reading.measurement_table import MeasurementTable
 from minimax_cal.robots.inverse_kinematics import pose_residual_and_jacobian, solve_nearest_joints
 from minimax_cal.robots.joint_sampling import random_joint_values
@@ -158,7 +159,7 @@ class SocketVisits(Instrument):
             for label in self.socket_labels
         )
 
-    def count_train_and_holdout_numbers(self, holdout_mask: Array) -> tuple[int, int]:
+    def count_train_and_holdout_numbers(self, holdout_mask: Array) -> NumberCounts:
         """Three less for each barycentre."""
         return count_independent_coordinates(self.socket, holdout_mask)
 
@@ -328,7 +329,7 @@ class SocketVisits(Instrument):
             "scale": "known distance" if self.known else other,
         }
 
-    def holdout_rows_and_notices(self, options: InstrumentOptions) -> tuple[Array, tuple[str, ...]]:
+    def holdout_rows_and_notices(self, options: InstrumentOptions) -> HoldoutMask:
         """(m,) True where a visit is held out; sockets of known distances stay."""
         needed = tuple(label for known in options.known_distances for label in known[:2])
         return select_holdout_visits(self, options.holdout, options.seed, needed)
@@ -390,7 +391,7 @@ def parse_socket_visits(table: MeasurementTable) -> SocketVisits:
 
 def select_holdout_visits(
     data: SocketVisits, holdout: float, seed: int, needed_sockets: tuple[str, ...]
-) -> tuple[Array, tuple[str, ...]]:
+) -> HoldoutMask:
     """(m,) True where a visit is held out, and a notice that says what was chosen.
 
     Whole sockets where there are enough: nothing of them shaped the fit.  Else visits, of which
@@ -404,9 +405,9 @@ def select_holdout_visits(
                 f"{data.at.source}: column split holds out all of socket {gone[0]!r}, whose "
                 "distance is given with known_distances=; leave some of its visits in training"
             )
-        return held, notices
+        return HoldoutMask(held, notices)
     if holdout == 0.0:
-        return held, notices
+        return HoldoutMask(held, notices)
     rng = np.random.default_rng(seed)
     labels = np.array(data.socket_labels)
     loose = labels[~np.isin(labels, needed_sockets)]
@@ -417,14 +418,14 @@ def select_holdout_visits(
             f"{whole} of {len(labels)} sockets are held out whole, their own barycentres fitted: "
             "an error is about that barycentre, three degrees of freedom less for each socket"
         )
-        return np.isin(data.socket, chosen), (notice,)
+        return HoldoutMask(np.isin(data.socket, chosen), (notice,))
     held = select_spare_visits(data, holdout, rng)
     count = f"{len(labels)} socket{'s' if len(labels) > 1 else ''}"
     notice = (
         f"with {count}, visits are held out, not sockets: an error is about the barycentre of the "
         "training visits"
     )
-    return held, (notice,)
+    return HoldoutMask(held, (notice,))
 
 
 def select_spare_visits(data: SocketVisits, holdout: float, rng: np.random.Generator) -> Array:
@@ -467,11 +468,13 @@ def compute_misclosures(ball_positions: Array, sockets: Array, holdout_mask: Arr
     return error
 
 
-def count_independent_coordinates(sockets: Array, holdout_mask: Array) -> tuple[int, int]:
+def count_independent_coordinates(sockets: Array, holdout_mask: Array) -> NumberCounts:
     """Independent coordinates of training and held-out visits: three less for each barycentre."""
     trained, left = np.unique(sockets[~holdout_mask]), np.unique(sockets[holdout_mask])
     alone = len(left) - int(np.isin(left, trained).sum())
-    return 3 * (int((~holdout_mask).sum()) - len(trained)), 3 * (int(holdout_mask.sum()) - alone)
+    return NumberCounts(
+        3 * (int((~holdout_mask).sum()) - len(trained)), 3 * (int(holdout_mask.sum()) - alone)
+    )
 
 
 SocketVisits.file = InstrumentColumns(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from minimax_cal.core.arrays import Array
 from minimax_cal.core.errors import DataError
 from minimax_cal.instruments.instrument import (
     NOT_READY,
+    FramePose,
     Instrument,
     InstrumentColumns,
     Words,
@@ -28,6 +29,13 @@ from minimax_cal.reading.measurement_table import TARGET_COLUMN_PATTERN, Measure
 from minimax_cal.robots.kinematics import rotation_from_vector, so3_right_jacobian
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.transforms import build_transform
+
+
+class PointErrors(NamedTuple):
+    """Measured minus predicted, and predicted points, (m, k, 3) along the base's axes [m]."""
+
+    errors: Array
+    predictions: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,18 +105,16 @@ class TrackerPoints(Instrument):
         """The targets."""
         return self.measurements_with_points.target_names
 
-    def base_rotation_and_origin(self, unknowns: Array) -> tuple[Array, Array]:
+    def base_rotation_and_origin(self, unknowns: Array) -> FramePose:
         """Rotation and origin."""
         axes = self.drawn.rotation
-        return axes @ rotation_from_vector(unknowns[3:6]), axes @ unknowns[:3]
+        return FramePose(axes @ rotation_from_vector(unknowns[3:6]), axes @ unknowns[:3])
 
-    def point_errors_and_predictions(
-        self, arm: FlangePoses, unknowns: Array
-    ) -> tuple[Array, Array]:
+    def point_errors_and_predictions(self, arm: FlangePoses, unknowns: Array) -> PointErrors:
         """(m, k, 3) measured minus predicted, and predicted, along the axes of the base [m]."""
         turn, origin = self.base_rotation_and_origin(unknowns)
         place = arm.place(self.flange_points(unknowns))
-        return (self.measurements_with_points.y - origin) @ turn - place, place
+        return PointErrors((self.measurements_with_points.y - origin) @ turn - place, place)
 
     def read(self, arm: FlangePoses, unknowns: Array) -> ResidualRows:
         """Three rows for each target at each pose, axis by axis, 0 where it was not measured."""

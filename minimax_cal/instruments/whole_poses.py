@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import permutations
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -54,6 +54,13 @@ QUATERNION_ORDER_ADVICE = "give qw, qx, qy, qz of the flange in the measurement 
 ROTATION_VECTOR_ADVICE = "write them as a rotation vector, or as a quaternion"
 MAX_ORTHONORMAL_DEVIATION = 1e-3  # a quaternion farther from unit length is no rotation
 TOOL_PARAMETER_NAMES = ("tool_x", "tool_y", "tool_z", "tool_rx", "tool_ry", "tool_rz")
+
+
+class PoseErrors(NamedTuple):
+    """Measured minus predicted positions (m, 3) [m], and angles between orientations (m,) [rad]."""
+
+    positions: Array
+    angles: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +179,7 @@ class WholePoses(TrackerPoints):
             self.flange_points(unknowns), virtual_reflector_positions(self.lever)
         )
 
-    def position_and_angle_errors(self, arm: FlangePoses, unknowns: Array) -> tuple[Array, Array]:
+    def position_and_angle_errors(self, arm: FlangePoses, unknowns: Array) -> PoseErrors:
         """`position_and_angle_errors` of the frame nearest to where the model has its
         reflectors.
         """
@@ -323,7 +330,14 @@ def quaternions_to_rotations(
     return Rotation.from_quat(quaternions[measured_rows], scalar_first=True)
 
 
-def propose_other_rotation_conventions(written: Array) -> Iterator[tuple[str, Array]]:
+class RotationReading(NamedTuple):
+    """What columns of a rotation may hold instead, and the rotations (m, 3, 3) then."""
+
+    message: str
+    rotations: Array
+
+
+def propose_other_rotation_conventions(written: Array) -> Iterator[RotationReading]:
     """What columns of a rotation may hold instead: what to say, and the rotations (m, 3, 3).
 
     written: (m, 3) of a rotation vector, or (m, 4) of a quaternion with the scalar first.
@@ -339,7 +353,9 @@ def propose_other_rotation_conventions(written: Array) -> Iterator[tuple[str, Ar
             ),
         ):
             turn = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
-            yield f"flange_qw ... looks like a quaternion {text}; {QUATERNION_ORDER_ADVICE}", turn
+            yield RotationReading(
+                f"flange_qw ... looks like a quaternion {text}; {QUATERNION_ORDER_ADVICE}", turn
+            )
         return
     first, *others = ("".join(order) for order in permutations("xyz"))
     tripled = [a + b + a for a, b in permutations("xyz", 2)]
@@ -347,8 +363,10 @@ def propose_other_rotation_conventions(written: Array) -> Iterator[tuple[str, Ar
     for unit, scale in (("", 1.0), (" in degrees", np.pi / 180.0), (" in radians", 180.0 / np.pi)):
         turn = Rotation.from_rotvec(scale * written).as_matrix()
         if unit:
-            yield f"{stem} a rotation vector{unit}: name their unit in the columns", turn
-        yield (
+            yield RotationReading(
+                f"{stem} a rotation vector{unit}: name their unit in the columns", turn
+            )
+        yield RotationReading(
             f"{stem} the rotation vector{unit} of the measurement frame in the flange's: give the "
             "flange's in the measurement frame",
             np.swapaxes(turn, 1, 2),
@@ -357,7 +375,7 @@ def propose_other_rotation_conventions(written: Array) -> Iterator[tuple[str, Ar
             for axes, about in ((order, "fixed"), (order.upper(), "moving")):
                 turn = Rotation.from_euler(axes, scale * written).as_matrix()
                 named = " ".join(f"R{axis}" for axis in order)
-                yield (
+                yield RotationReading(
                     (
                         f"{stem} Euler angles{unit} about {about} axes, "
                         f"{named}; {ROTATION_VECTOR_ADVICE}"
@@ -366,30 +384,35 @@ def propose_other_rotation_conventions(written: Array) -> Iterator[tuple[str, Ar
                 )
 
 
-def choose_rotation_lever(
-    columns: Mapping[str, Array], given_lever: float | None
-) -> tuple[float, str]:
+class RotationLever(NamedTuple):
+    """Length that converts rotation errors to metres [m], and where it comes from."""
+
+    length: float
+    source: str
+
+
+def choose_rotation_lever(columns: Mapping[str, Array], given_lever: float | None) -> RotationLever:
     """The lever and where it comes from.  given_lever: asked for [m], None where not."""
     if given_lever is not None:
-        return given_lever, "as given"
+        return RotationLever(given_lever, "as given")
     if {"u95", "rotation_u95"} <= set(columns):
         ratio = np.nanmedian(columns["u95"] / columns["rotation_u95"])
         if np.isfinite(ratio) and ratio > 0.0:
-            return float(ratio), "typical u95_mm over rotation_u95_rad"
-    return (
-        DEFAULT_ROTATION_LEVER,
-        "by default; give the lever, the ratio of linear and angular noise",
+            return RotationLever(float(ratio), "typical u95_mm over rotation_u95_rad")
+    return RotationLever(
+        DEFAULT_ROTATION_LEVER, "by default; give the lever, the ratio of linear and angular noise"
     )
 
 
-def position_and_angle_errors(predicted_poses: Array, data: WholePoses) -> tuple[Array, Array]:
+def position_and_angle_errors(predicted_poses: Array, data: WholePoses) -> PoseErrors:
     """Measured minus predicted positions (m, 3) [m], and angles between orientations (m,) [rad].
 
     predicted_poses: (m, 4, 4) predicted.
     """
     turn = np.swapaxes(predicted_poses[:, :3, :3], 1, 2) @ data.pose[:, :3, :3]
-    return data.pose[:, :3, 3] - predicted_poses[:, :3, 3], np.asarray(
-        Rotation.from_matrix(turn).magnitude()
+    return PoseErrors(
+        data.pose[:, :3, 3] - predicted_poses[:, :3, 3],
+        np.asarray(Rotation.from_matrix(turn).magnitude()),
     )
 
 

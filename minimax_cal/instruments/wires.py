@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from minimax_cal.instruments.instrument import (
     DataCorrection,
     Instrument,
     InstrumentColumns,
+    NoticeAndMend,
     Words,
     bare,
     check_instrument_data,
@@ -35,6 +36,13 @@ WIRE_COLUMN_PATTERN = re.compile(r"wire(\d+)_(mm|m)")
 MIN_LENGTHS_PER_WIRE = 5  # of one wire; its anchor alone has three unknowns
 SCREENING_LENGTHS_PER_WIRE = 60  # poses that tell one start from another
 MAX_OFFSET_SQUARES_RATIO = 0.25  # of the mean square: what explains so much is worth a look
+
+
+class AnchorsAndOffsets(NamedTuple):
+    """Anchors (s, 3) and offsets (s,) of wires [m]."""
+
+    anchors: Array
+    offsets: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,10 +161,10 @@ class WireLengths(Instrument):
         error = self.length[pose, wire] - distance - offsets[wire]
         return ResidualRows(error, pose, point, along, np.zeros_like(along), by_own, wire)
 
-    def anchors_and_offsets(self, unknowns: Array) -> tuple[Array, Array]:
+    def anchors_and_offsets(self, unknowns: Array) -> AnchorsAndOffsets:
         """Anchors (s, 3) and offsets (s,) [m]."""
         s = len(self.wires)
-        return unknowns[3 : 3 + 3 * s].reshape(s, 3), unknowns[3 + 3 * s :]
+        return AnchorsAndOffsets(unknowns[3 : 3 + 3 * s].reshape(s, 3), unknowns[3 + 3 * s :])
 
     def starts(self, arm: FlangePoses, free_unknowns: Array) -> Sequence[Array]:
         """From some places of the target, anchors and offsets by trilateration.
@@ -225,12 +233,12 @@ class WireLengths(Instrument):
         """Offsets, where they are not fitted."""
         return {} if self.offset else {"offset": True}
 
-    def describe_wider_fit(self, noise_before: float, noise_after: float) -> tuple[str, str]:
+    def describe_wider_fit(self, noise_before: float, noise_after: float) -> NoticeAndMend:
         """A notice where an offset of each wire explains most of what the fit leaves."""
         if noise_after**2 > MAX_OFFSET_SQUARES_RATIO * noise_before**2:
-            return "", ""
+            return NoticeAndMend("", "")
         mend = "fit the wires' zeros with offset="
-        return (
+        return NoticeAndMend(
             f"with an offset of each wire the lengths fit to "
             f"{1e3 * noise_after:.3g} mm, without to "
             f"{1e3 * noise_before:.3g} mm: the wires' zeros look off; fit them with offset=",

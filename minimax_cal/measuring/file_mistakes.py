@@ -95,7 +95,7 @@ MEND_EXAMPLES = "shift=1, shift=-1@40.. (from line 40 on), reverse, joints=1:3:2
 MAX_MEND_SCALE = 1e3
 
 
-def with_points_shifted_by_rows(data: Measurements, row_shift: int) -> Measurements:
+def with_points_from_rows_ahead(data: Measurements, row_shift: int) -> Measurements:
     """Each row with the points of the row that many further on; rows that get none are gone."""
     if row_shift > 0:
         poses, points = slice(None, -row_shift), slice(row_shift, None)
@@ -313,7 +313,7 @@ def apply_shift_mend(data: Measurements, shift_text: str) -> Measurements:
             f"mend='shift={shift_text}': no row stands there; lines are {data.line.min()} to "
             f"{data.line.max()}"
         )
-    moved = with_points_shifted_by_rows(data.take(inside), int(found[1]))
+    moved = with_points_from_rows_ahead(data.take(inside), int(found[1]))
     return data.take(data.line < first).append_measurements(moved, data.take(data.line > last))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import combinations, permutations
+from typing import NamedTuple
 
 import numpy as np
 
@@ -145,7 +146,15 @@ def list_robot_notices(robot: Robot, data: Measurements) -> list[str]:
     ]
 
 
-def find_best_target_orders(distances: Array) -> tuple[Array, Array, Array]:
+class TargetOrders(NamedTuple):
+    """Order (m, k) of targets in which each row fits best, its squares (m,), those as given."""
+
+    orders: Array
+    best_squares: Array
+    given_squares: Array
+
+
+def find_best_target_orders(distances: Array) -> TargetOrders:
     """Under which names the targets of each row fit best.
 
     distances: (k, k, m) distance from measured target i to predicted target j at each pose, NaN
@@ -157,7 +166,7 @@ def find_best_target_orders(distances: Array) -> tuple[Array, Array, Array]:
     orders = list(list_target_orders(k))
     cost = np.stack([squared[range(k), order, :].sum(axis=0) for order in orders])
     best = cost.argmin(axis=0)
-    return np.array(orders)[best], cost.min(axis=0), cost[0]
+    return TargetOrders(np.array(orders)[best], cost.min(axis=0), cost[0])
 
 
 def find_swapped_rows(best_squares: Array, given_squares: Array) -> Array:

@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -525,7 +526,14 @@ def drop_rows_without_targets(data: Measurements, repeated_rows: Array) -> Measu
     return data.take(~blind & ~repeated_rows)
 
 
-def find_pasted_rows(table: MeasurementTable, counted_rows: Array) -> tuple[Array, list[str]]:
+class PastedRows(NamedTuple):
+    """Rows (m,) that repeat an earlier one in every cell, and notices of them."""
+
+    repeated_rows: Array
+    notices: list[str]
+
+
+def find_pasted_rows(table: MeasurementTable, counted_rows: Array) -> PastedRows:
     """(m,) True for rows that repeat an earlier one in every cell, and a notice of them.
 
     Nothing is measured twice to the last digit; as repeats they would tell of no noise at all.
@@ -537,13 +545,14 @@ def find_pasted_rows(table: MeasurementTable, counted_rows: Array) -> tuple[Arra
     again = (source < np.arange(len(source))) & counted_rows
     at = np.flatnonzero(again)
     if not len(at):
-        return again, []
+        return PastedRows(again, [])
     runs = np.split(at, 1 + np.flatnonzero((np.diff(at) != 1) | (np.diff(source[at]) != 1)))
     told = [describe_pasted_rows(table, run, source[run]) for run in runs[:5]]
     more = f", and {len(runs) - 5} more places" if len(runs) > 5 else ""
-    return again, [
-        f"{table.path}: {', '.join(told)}{more} in every cell: pasted twice? they count once"
-    ]
+    return PastedRows(
+        again,
+        [f"{table.path}: {', '.join(told)}{more} in every cell: pasted twice? they count once"],
+    )
 
 
 def describe_pasted_rows(table: MeasurementTable, rows: Array, source_rows: Array) -> str:
@@ -602,12 +611,19 @@ def format_measurements_csv(data: Measurements) -> str:
     return format_csv(rows)
 
 
-def file_column_name_and_scale(stem: str) -> tuple[str, float]:
+class FileColumn(NamedTuple):
+    """Name of a column in a file, with its unit, and the factor from SI."""
+
+    name: str
+    scale: float
+
+
+def file_column_name_and_scale(stem: str) -> FileColumn:
     """Name with its unit, and the factor from SI, of an optional column."""
     if stem == "rotation_u95":
-        return f"{stem}_rad", 1.0
+        return FileColumn(f"{stem}_rad", 1.0)
     for unit in (
         STANDARD_COLUMN_KINDS[kind].units[:1] if (kind := standard_column_kind(stem)) else ()
     ):
-        return f"{stem}_{unit}", 1.0 / SI_PER_COLUMN_UNIT.get(unit, 1.0)
-    return stem, 1.0
+        return FileColumn(f"{stem}_{unit}", 1.0 / SI_PER_COLUMN_UNIT.get(unit, 1.0))
+    return FileColumn(stem, 1.0)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import wraps
+from typing import NamedTuple
 from weakref import finalize
 
 import numpy as np
@@ -107,7 +108,14 @@ def sum_rows_by_group(rows: Array, group_labels: Array) -> Array:
     return out
 
 
-def deviations_from_group_means(values: Array, group_labels: Array) -> tuple[Array, Array]:
+class GroupDeviations(NamedTuple):
+    """Deviations (m, c) from the mean of the group, and degrees of freedom (c,)."""
+
+    deviations: Array
+    degrees_of_freedom: Array
+
+
+def deviations_from_group_means(values: Array, group_labels: Array) -> GroupDeviations:
     """Deviations (m, c) from the mean of the group, 0 for NaN, and degrees of freedom of each."""
     known = np.isfinite(values)
     _, place = np.unique(group_labels, return_inverse=True)
@@ -117,7 +125,7 @@ def deviations_from_group_means(values: Array, group_labels: Array) -> tuple[Arr
     moved = np.where(known & known[first], values - values[first], 0.0)
     moved = np.where(known & ~known[first], values, moved)
     alone = np.where(known, moved - (sum_rows_by_group(moved, group_labels)[place] / count), 0.0)
-    return alone, np.where(known, 1.0 - 1.0 / count, 0.0)
+    return GroupDeviations(alone, np.where(known, 1.0 - 1.0 / count, 0.0))
 
 
 def describe_mislabelled_pose(data: Measurements) -> str:
@@ -158,7 +166,14 @@ def find_close_pairs(q: Array, max_distance: float) -> Array:
     return np.concatenate(found)
 
 
-def minimum_spanning_tree(q: Array) -> tuple[Array, Array]:
+class SpanningTree(NamedTuple):
+    """Edges (m - 1, 2) of the shortest tree that joins all rows, and their lengths (m - 1,)."""
+
+    edges: Array
+    lengths: Array
+
+
+def minimum_spanning_tree(q: Array) -> SpanningTree:
     """Edges (m - 1, 2) of the shortest tree that joins all rows of q (m, n), and their lengths.
 
     These are the heights at which single linkage joins [Prim 1957].
@@ -173,7 +188,7 @@ def minimum_spanning_tree(q: Array) -> tuple[Array, Array]:
         distance[at] = np.inf
         at = int(distance.argmin())
         pairs[step], length[step] = (nearest[at], at), distance[at]
-    return pairs, np.sqrt(length)
+    return SpanningTree(pairs, np.sqrt(length))
 
 
 def number_groups_by_joints(group_labels: Array, q: Array) -> Array:
@@ -276,9 +291,17 @@ def group_for_holdout(data: Measurements, group_by: str | None = None) -> Array:
     return merge_repeats_by_label(data, columns[group_by])
 
 
+class HoldoutSplit(NamedTuple):
+    """Training and held-out poses, and notices."""
+
+    train: Measurements
+    holdout: Measurements
+    notices: tuple[str, ...]
+
+
 def split_train_and_holdout(
     data: Measurements, holdout: float, seed: int, group_by: str | None = None
-) -> tuple[Measurements, Measurements, tuple[str, ...]]:
+) -> HoldoutSplit:
     """Training and held-out poses, and notices.
 
     A `split_train_and_holdout` column decides where there is one; else a seeded random share of the
@@ -286,7 +309,7 @@ def split_train_and_holdout(
     DataError.
     """
     held, notices = select_holdout_rows(data, holdout, seed, group_by)
-    return data.take(~held), data.take(held), notices
+    return HoldoutSplit(data.take(~held), data.take(held), notices)
 
 
 def check_holdout_and_seed(holdout: float, seed: int) -> None:
@@ -296,9 +319,16 @@ def check_holdout_and_seed(holdout: float, seed: int) -> None:
         raise OptionError(f"holdout {holdout:g} is not a fraction; give 0 <= holdout < 1, as 0.2")
 
 
+class HoldoutMask(NamedTuple):
+    """Rows (m,) True where no fit may see them, and notices."""
+
+    holdout_rows: Array
+    notices: tuple[str, ...]
+
+
 def select_holdout_rows(
     data: Measurements, holdout: float, seed: int, group_by: str | None = None
-) -> tuple[Array, tuple[str, ...]]:
+) -> HoldoutMask:
     """(m,) True for rows that no fit may see, and notices.  As `split_train_and_holdout`."""
     check_holdout_and_seed(holdout, seed)
     if "split" in data.columns and group_by is None:
@@ -313,14 +343,17 @@ def select_holdout_rows(
     held = np.isin(group, np.random.default_rng(seed).permutation(count)[:chosen])
     poses = len(np.unique(group_repeated_poses(data)))
     if group_by is None and 1.5 * count < poses:
-        return held, (
-            f"{poses} poses stand in {count} groups: whole groups are held out, and intervals "
-            "count groups, not poses",
+        return HoldoutMask(
+            held,
+            (
+                f"{poses} poses stand in {count} groups: whole groups are held out, and intervals "
+                "count groups, not poses",
+            ),
         )
-    return held, ()
+    return HoldoutMask(held, ())
 
 
-def holdout_rows_from_split_column(data: Measurements) -> tuple[Array, tuple[str, ...]]:
+def holdout_rows_from_split_column(data: Measurements) -> HoldoutMask:
     """What the `split_train_and_holdout` column holds out.  Raises DataError."""
     labels = np.char.lower(data.columns["split"].astype(str))
     odd = ~np.isin(labels, ("train", "holdout"))
@@ -337,7 +370,7 @@ def holdout_rows_from_split_column(data: Measurements) -> tuple[Array, tuple[str
     shared = group_repeated_poses(data)
     if np.isin(shared[held], shared[~held]).any():
         notices += ("some poses stand both in training and in the held-out rows",)
-    return held, notices
+    return HoldoutMask(held, notices)
 
 
 # ---- parts that are left out whole -------------------------------------------------------------

@@ -91,7 +91,7 @@ def rows_in_visit_order(data: Measurements) -> Array:
     return np.lexsort((data.columns["order"].astype(float), session_indices(data)))
 
 
-def list_time_notices(data: Measurements) -> list[str]:
+def list_backward_time_notices(data: Measurements) -> list[str]:
     """A notice where `time_s` falls from one visit to the next of a session."""
     rows = rows_in_visit_order(data)
     rows = rows[np.isfinite(data.columns.get("time", np.full(data.poses, np.nan))[rows])]

@@ -7,6 +7,7 @@ import re
 import unicodedata
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -151,13 +152,21 @@ UNAMBIGUOUS_MEANINGS = (
 MEANING_BY_WORD = {word: meaning for meaning, words in WORDS_BY_MEANING.items() for word in words}
 
 
-def parse_standard_column_name(name: str) -> tuple[str, str, str]:
+class StandardColumnName(NamedTuple):
+    """The parts of one of this project's column names; all '' for another name."""
+
+    kind: str
+    name_without_unit: str
+    unit: str
+
+
+def parse_standard_column_name(name: str) -> StandardColumnName:
     """The kind of one of this project's columns, its name without the unit, and the unit; or ''."""
     for kind, own in STANDARD_COLUMN_KINDS.items():
         if found := re.fullmatch(own.full_name_pattern, name):
             unit = found[found.re.groups] if own.units else ""
-            return kind, name.removesuffix(f"_{unit}"), unit
-    return "", name, ""
+            return StandardColumnName(kind, name.removesuffix(f"_{unit}"), unit)
+    return StandardColumnName("", name, "")
 
 
 def standard_column_kind(name_without_unit: str) -> str:
@@ -200,18 +209,25 @@ def standard_unit_name(text: str) -> str:
     )
 
 
-def split_name_and_unit(name: str) -> tuple[str, str]:
+class NameAndUnit(NamedTuple):
+    """A header's name without its unit, and the unit, '' where it has none."""
+
+    name: str
+    unit: str
+
+
+def split_name_and_unit(name: str) -> NameAndUnit:
     """A header's name without its unit, and the unit: 'X [mm]', 'x (mm)', 'x_mm', 'x mm'."""
     name = " ".join(unicodedata.normalize("NFKC", name).strip("\ufeff'\" \n").split())
     if (
         found := re.fullmatch("(.*?)\\s*[\\[(<\u3010]([^\\[\\](]*)[\\])>\u3011]", name)
     ) and standard_unit_name(found[2]):
-        return found[1].strip(), standard_unit_name(found[2])
+        return NameAndUnit(found[1].strip(), standard_unit_name(found[2]))
     if (
         found := re.fullmatch(r"(.+?)(?:[ _]|,\s*|\s+/\s*)([^ _,/]+)", name)
     ) and standard_unit_name(found[2]):
-        return found[1].strip(), standard_unit_name(found[2])
-    return name, ""
+        return NameAndUnit(found[1].strip(), standard_unit_name(found[2]))
+    return NameAndUnit(name, "")
 
 
 def names_without_units(names: Sequence[str]) -> tuple[str, ...]:

@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
+from typing import NamedTuple
 
 from minimax_cal.reading.column_words import (
     JOINT_COLUMN_UNITS,
@@ -60,9 +61,16 @@ def ros_joint_state_patterns(member_name: str) -> tuple[str, ...]:
     )
 
 
-def joint_quantity_patterns(quantity_words: str) -> tuple[str, str]:
+class JointQuantityPatterns(NamedTuple):
+    """Regular expressions of a joint quantity's word before, and after, the joint's number."""
+
+    before_number: str
+    after_number: str
+
+
+def joint_quantity_patterns(quantity_words: str) -> JointQuantityPatterns:
     """Names of what a joint does, in folded words: before its number, or after it."""
-    return (
+    return JointQuantityPatterns(
         rf"(?:{quantity_words})[ _.-]?(?:{JOINT_WORDS_REGEX})?[ _.-]?{JOINT_GROUP_REGEX}",
         rf"(?:{JOINT_WORDS_REGEX})[ _.-]?{JOINT_GROUP_REGEX}[ _.-]?(?:{quantity_words})",
     )
@@ -191,13 +199,22 @@ def parse_log_header(log_format: LogFormat, header: Sequence[str]) -> dict[int, 
     return {i: place for i, place in found if place}
 
 
-def detect_log_format(header: Sequence[str]) -> tuple[LogFormat, dict[int, LogColumn]] | None:
+class DetectedLogFormat(NamedTuple):
+    """A format of logs, and what the columns of a file hold in it, by their index."""
+
+    log_format: LogFormat
+    columns: dict[int, LogColumn]
+
+
+def detect_log_format(header: Sequence[str]) -> DetectedLogFormat | None:
     """The first format with joint columns in a header, and what its columns hold."""
     for form in LOG_FORMATS:
         places = parse_log_header(form, header)
         joints = [place.joint for place in places.values() if place.kind == "q"]
         if joints:
-            return replace(form, first=0) if form.words and "0" in joints else form, places
+            return DetectedLogFormat(
+                replace(form, first=0) if form.words and "0" in joints else form, places
+            )
     return None
 
 

@@ -6,6 +6,7 @@ import re
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -64,6 +65,20 @@ EMPTY_CELL_WORDS = ("", "-", "--", "---", "n/a", "na", "#n/a", "n.a.", "k.a.", "
 JOINT_OPTION_COLUMN_PATTERN = re.compile(r"(?:approach|tau|qread)(\d+)(?:_\w+)?")
 
 
+class OptionalColumns(NamedTuple):
+    """Optional columns in SI, and why others are not used, both by the column's name."""
+
+    values: dict[str, Array]
+    unused_reasons: dict[str, str]
+
+
+class JointColumns(NamedTuple):
+    """Joint values (m, n) [rad, m], and (n,) True for columns with a unit of length."""
+
+    joint_values: Array
+    sliding: Array
+
+
 @dataclass(frozen=True, eq=False)
 class MeasurementTable:
     """A table as text: header, rows, and the line on which each row ends.
@@ -107,7 +122,7 @@ class MeasurementTable:
         self,
         handled_pattern: re.Pattern[str] = MATCH_NOTHING_PATTERN,
         uncertainty_pattern: re.Pattern[str] = MATCH_NOTHING_PATTERN,
-    ) -> tuple[dict[str, Array], dict[str, str]]:
+    ) -> OptionalColumns:
         """The optional columns by name, in SI, and columns that are not used, with why.
 
         handled_pattern: names of columns that the caller reads.  uncertainty_pattern: of the
@@ -132,9 +147,9 @@ class MeasurementTable:
                 columns[stem] = self.number_column(name, unit=unit, allow_empty=True)
             else:
                 unused[name] = "" if kind else similar_column_hint(name, EXAMPLE_COLUMN_NAMES)
-        return columns, unused
+        return OptionalColumns(columns, unused)
 
-    def joint_values_and_sliding(self) -> tuple[Array, Array]:
+    def joint_values_and_sliding(self) -> JointColumns:
         """Joint values (m, n) [rad, m], and (n,) True where a column has a unit of length."""
         found = sorted(
             (int(m[1]), m[2], name)
@@ -150,7 +165,7 @@ class MeasurementTable:
                 f"{self.text_column(name)[row]} cannot be; "
                 "check the number and its unit"
             )
-        return q, np.array([unit in ("m", "mm") for _, unit, _ in found])
+        return JointColumns(q, np.array([unit in ("m", "mm") for _, unit, _ in found]))
 
 
 def read_measurement_table(path: Path | str | Sheet) -> MeasurementTable:

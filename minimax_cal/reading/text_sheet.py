@@ -13,7 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import mode
-from typing import overload
+from typing import NamedTuple, overload
 
 import numpy as np
 
@@ -252,9 +252,15 @@ def parse_sheet_table(
     return replace(found, torn=lost, above=above, below=below)
 
 
-def split_delimiter_comments_lines(
-    sheet: Sheet, lone_column_delimiter: str
-) -> tuple[str, dict[int, str], list[str]]:
+class DelimitedText(NamedTuple):
+    """The delimiter of a text, its comments by line number, and its other lines."""
+
+    delimiter: str
+    comments: dict[int, str]
+    lines: list[str]
+
+
+def split_delimiter_comments_lines(sheet: Sheet, lone_column_delimiter: str) -> DelimitedText:
     """The delimiter of a text, its comments by line, and its other lines.  Raises DataError.
 
     A line below the first other one that has as many cells as most is no comment, however it
@@ -278,7 +284,7 @@ def split_delimiter_comments_lines(
                  if n < told[0] or line.count(delimiter) != usual}  # fmt: skip
     for n in notes:
         lines[n - 1] = ""
-    return delimiter, notes, lines
+    return DelimitedText(delimiter, notes, lines)
 
 
 def parse_pure_number_table(
@@ -332,7 +338,14 @@ def parse_pure_number_table(
                    decimal="," if comma else ".", cells=LazyRows(body, delimiter))  # fmt: skip
 
 
-def find_table_row_range(rows: list[Row], are_rows_padded: bool) -> tuple[int, int]:
+class RowRange(NamedTuple):
+    """Index of the first row of a table, and of the first row below it."""
+
+    first: int
+    end: int
+
+
+def find_table_row_range(rows: list[Row], are_rows_padded: bool) -> RowRange:
     """The first row of the table, and the first below it.
 
     Above it are rows that say something else, half as long, or shorter; below it means and the
@@ -352,24 +365,31 @@ def find_table_row_range(rows: list[Row], are_rows_padded: bool) -> tuple[int, i
         if not (is_summary_cell(filled[0]) or (of_all and 2 * lengths[last - 1] <= most)):
             break
         last -= 1
-    return first if first < len(rows) - 1 else 0, last
+    return RowRange(first if first < len(rows) - 1 else 0, last)
 
 
-def split_header_from_rows(rows: list[NumberedRow]) -> tuple[tuple[str, ...], list[NumberedRow]]:
+class HeaderAndRows(NamedTuple):
+    """Names of columns, and the rows below them."""
+
+    header: tuple[str, ...]
+    rows: list[NumberedRow]
+
+
+def split_header_from_rows(rows: list[NumberedRow]) -> HeaderAndRows:
     """Names of the columns with their units, and the rows below.
 
     A row of names that are the same, or not there, has names of groups above it or below it: SMR 1
     over X, Y, Z.
     """
     if not is_header_row(rows[0][1]):
-        return (), rows
+        return HeaderAndRows((), rows)
     names, rows = [*strip_empty_end_cells(rows[0][1])], rows[1:]
     if "" in names and len(rows) > 1 and not any(map(is_number_cell, rows[0][1])):
         names, rows = join_group_names(names, rows[0][1]), rows[1:]
     if rows and (units := parse_unit_row(rows[0][1], len(names))):
         names = [f"{n} [{u}]" if u else n for n, u in zip(names, units, strict=True)]
         rows = rows[1:]
-    return tuple(names), rows
+    return HeaderAndRows(tuple(names), rows)
 
 
 def join_group_names(group_names: Sequence[str], names_below: Row) -> list[str]:
@@ -407,7 +427,14 @@ def parse_unit_row(row: Row, column_count: int) -> list[str]:
     return [cell if standard_unit_name(cell) else "" for cell in cells] if known else []
 
 
-def read_and_decode_text(path: Path) -> tuple[str, str]:
+class DecodedText(NamedTuple):
+    """The text of a file, its lines ended alike, and the name of its encoding."""
+
+    text: str
+    encoding: str
+
+
+def read_and_decode_text(path: Path) -> DecodedText:
     """The text, its lines ended alike, and the name of its encoding.  Raises DataError."""
     raw = read_bytes(path, error_type=DataError)
     if raw.startswith(SPREADSHEET_FILE_STARTS):
@@ -418,7 +445,7 @@ def read_and_decode_text(path: Path) -> tuple[str, str]:
                 text = raw.decode(codec)
                 if "\r" in text:
                     text = text.replace("\r\n", "\n").replace("\r", "\n")
-                return text, name
+                return DecodedText(text, name)
     raise DataError(f"{path}: is not a text file; expected rows of numbers")
 
 

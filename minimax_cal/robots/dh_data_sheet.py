@@ -10,7 +10,7 @@ import difflib
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from minimax_cal.core.errors import DataError, RobotError
 from minimax_cal.reading.column_words import fold_case_and_accents, split_name_and_unit
@@ -120,7 +120,15 @@ def read_dh_data_sheet(path: Path) -> dict[str, Any]:
     }
 
 
-def parse_header_cell(path: Path, header_cell: str) -> tuple[str, str, bool]:
+class HeaderCell(NamedTuple):
+    """The schema's key of a header's cell, its unit, and whether the name is Craig's."""
+
+    key: str
+    unit: str
+    is_craig: bool
+
+
+def parse_header_cell(path: Path, header_cell: str) -> HeaderCell:
     """The schema's key of a header's cell, its unit, and whether it is one of Craig's names."""
     stem, unit = split_name_and_unit(header_cell)
     stem = fold_case_and_accents(stem.translate(GREEK_TO_LATIN))
@@ -137,7 +145,7 @@ def parse_header_cell(path: Path, header_cell: str) -> tuple[str, str, bool]:
     ):
         (near,) = difflib.get_close_matches(key, SHEET_NUMBER_KEYS, 1, cutoff=0.0)
         raise RobotError(f"{path}: unknown column {header_cell!r}; did you mean {near}?")
-    return key, unit, craig
+    return HeaderCell(key, unit, craig)
 
 
 def find_common_unit(

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,6 +36,13 @@ def link_parameter_names(joint_count: int, *, modified: bool) -> tuple[str, ...]
         for kind, more in zip(MDH_NAMES, later, strict=True)
         for i in range(joint_count)
     )
+
+
+class FileRows(NamedTuple):
+    """Rows (n, 5) in a file's convention, and (5,) what follows the last joint of Craig's."""
+
+    rows: Array
+    end_row: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,20 +81,28 @@ class DhNotation:
             out[0, [THETA, D]] = -1.0
         return out
 
-    def rows_in_file_convention(self, mdh: Array, prismatic: Array) -> tuple[Array, Array]:
+    def rows_in_file_convention(self, mdh: Array, prismatic: Array) -> FileRows:
         """(n, 5) rows as the file has them, and (5,) what follows the last joint of Craig's."""
         told = self.values_in_file_convention(mdh, prismatic)
         if not self.modified:
-            return told, np.zeros(5)
+            return FileRows(told, np.zeros(5))
         first = np.zeros(5)
         first[ALPHA] = np.pi * self.half_turn
         end, rows = told[-1].copy(), told.copy()
         rows[:, CRAIG_SHIFTED_COLUMNS] = np.vstack([first, told[:-1]])[:, CRAIG_SHIFTED_COLUMNS]
         end[[D, THETA]] = 0.0
-        return rows, end
+        return FileRows(rows, end)
 
 
 STANDARD_NOTATION = DhNotation()
+
+
+class ConvertedRows(NamedTuple):
+    """Rows (n, 5) and signs (n,) of the kinematics, and how to write them as in the file."""
+
+    mdh: Array
+    joint_signs: Array
+    notation: DhNotation
 
 
 def convert_modified_rows(
@@ -96,7 +112,7 @@ def convert_modified_rows(
     joint_offsets: Array,
     end_row: Array,
     source: str,
-) -> tuple[Array, Array, DhNotation]:
+) -> ConvertedRows:
     """The engine's rows (n, 5) and signs (n,) of Craig's rows, and how to write them again.
 
     modified_rows: (n, 5) with theta and d without their offset (n,).  end_row: (5,) what follows
@@ -114,14 +130,22 @@ def convert_modified_rows(
     mdh[:, CRAIG_SHIFTED_COLUMNS] = np.vstack([modified_rows[1:], end_row])[
         :, CRAIG_SHIFTED_COLUMNS
     ]
-    return *apply_offsets_and_half_turn(
-        mdh, joint_signs, prismatic, joint_offsets, half_turn
-    ), DhNotation(True, half_turn, joint_offsets)
+    return ConvertedRows(
+        *apply_offsets_and_half_turn(mdh, joint_signs, prismatic, joint_offsets, half_turn),
+        DhNotation(True, half_turn, joint_offsets),
+    )
+
+
+class RowsAndSigns(NamedTuple):
+    """Rows (n, 5) and signs (n,) of the kinematics."""
+
+    mdh: Array
+    joint_signs: Array
 
 
 def apply_offsets_and_half_turn(
     mdh: Array, joint_signs: Array, prismatic: Array, joint_offsets: Array, half_turn: bool
-) -> tuple[Array, Array]:
+) -> RowsAndSigns:
     """The engine's rows and signs: offsets added, a half turn before joint 1 taken through it."""
     mdh, joint_signs = mdh.copy(), joint_signs.copy()
     if len(joint_offsets):
@@ -130,4 +154,4 @@ def apply_offsets_and_half_turn(
         mdh[0, [THETA, D]] *= -1.0
         mdh[0, ALPHA] += np.pi
         joint_signs[0] *= -1.0
-    return mdh, joint_signs
+    return RowsAndSigns(mdh, joint_signs)

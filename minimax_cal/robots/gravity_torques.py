@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -55,7 +55,14 @@ def assumed_link_inertia(mdh: Array, link_index: int, mass: float) -> float:
     return mass * length**2 / 6.0
 
 
-def assumed_link_masses_and_centres(mdh: Array) -> tuple[Array, Array]:
+class LinkMasses(NamedTuple):
+    """Masses (n,) [kg] and centres of gravity (n, 3) in the link frames [m]."""
+
+    masses: Array
+    centres: Array
+
+
+def assumed_link_masses_and_centres(mdh: Array) -> LinkMasses:
     """(n,) masses [kg] and (n, 3) centres of gravity in the link frames [m]: uniform tubes.
 
     For links whose masses nobody tells.  mdh: (n, 5) [m, rad].
@@ -63,7 +70,7 @@ def assumed_link_masses_and_centres(mdh: Array) -> tuple[Array, Array]:
     # back from frame i towards frame i-1: half of a along x, half of d along the old z
     ca, sa = np.cos(mdh[:, 3]), np.sin(mdh[:, 3])
     halfway = -0.5 * np.stack([mdh[:, 0], mdh[:, 1] * sa, mdh[:, 1] * ca], axis=1)
-    return ASSUMED_LINK_MASS_PER_METRE * np.hypot(mdh[:, 0], mdh[:, 1]), halfway
+    return LinkMasses(ASSUMED_LINK_MASS_PER_METRE * np.hypot(mdh[:, 0], mdh[:, 1]), halfway)
 
 
 def known_link_mass_mask(robot: Robot) -> Array:
@@ -71,11 +78,11 @@ def known_link_mass_mask(robot: Robot) -> Array:
     return np.isfinite(robot.mass) & np.isfinite(robot.com).all(axis=1)
 
 
-def link_masses_and_centres(robot: Robot, min_mass: float = 0.0) -> tuple[Array, Array]:
+def link_masses_and_centres(robot: Robot, min_mass: float = 0.0) -> LinkMasses:
     """(n,) masses [kg] and (n, 3) centres in the link frames [m]: as told, else those of tubes.
 
     min_mass: of any link [kg].
     """
     known, (tube, halfway) = known_link_mass_mask(robot), assumed_link_masses_and_centres(robot.mdh)
     mass = np.maximum(np.where(known, robot.mass, tube), min_mass)
-    return mass, np.where(known[:, None], robot.com, halfway)
+    return LinkMasses(mass, np.where(known[:, None], robot.com, halfway))

@@ -6,6 +6,7 @@ One search for all: damped Gauss-Newton in a box, every pose of a batch at its o
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,6 +24,13 @@ FLANGE_ORIGIN = np.zeros(3)
 ResidualAndJacobian = Callable[[Array, Array], tuple[Array, Array]]
 
 
+class PoseResidual(NamedTuple):
+    """What is missing of goal poses (m, r) [m], and its derivatives (m, r, n) by the joints."""
+
+    residual: Array
+    jacobian: Array
+
+
 def pose_residual_and_jacobian(
     mdh: Array,
     q: Array,
@@ -31,7 +39,7 @@ def pose_residual_and_jacobian(
     goal_poses: Array,
     rotation_lever: float,
     tool_point: Array = FLANGE_ORIGIN,
-) -> tuple[Array, Array]:
+) -> PoseResidual:
     """What is missing of goals (m, r) [m], turns times the lever, and its slope (m, r, n).
 
     q: (m, n), couplings and signs applied [rad, m].  joint_to_chain: (n, n) that did so.
@@ -51,7 +59,7 @@ def pose_residual_and_jacobian(
         away = Rotation.from_matrix(goal_poses[:, :3, :3] @ np.swapaxes(pose, -1, -2)).as_rotvec()
         residual = np.concatenate([residual, rotation_lever * away], axis=1)
         jacobian = np.concatenate([moves, np.where(slides, 0.0, rotation_lever * links.z)], axis=1)
-    return residual, np.moveaxis(jacobian, (2, 1), (0, 1)) @ joint_to_chain
+    return PoseResidual(residual, np.moveaxis(jacobian, (2, 1), (0, 1)) @ joint_to_chain)
 
 
 def solve_nearest_joints(
@@ -118,13 +126,20 @@ def solve_nearest_joints(
     return q
 
 
+class InverseSolution(NamedTuple):
+    """Joint values (..., n) [rad, m], and what is missing of each goal (...) [m]."""
+
+    joint_values: Array
+    missing_lengths: Array
+
+
 def solve_joints_with_restarts(
     solve_from_start: Callable[[Array, Array], tuple[Array, Array]],
     goal_poses: Array,
     near_joints: Array | None,
     lower: Array,
     upper: Array,
-) -> tuple[Array, Array]:
+) -> InverseSolution:
     """Joints (..., n) at poses (..., 4, 4), and (...) what is missing [m].
 
     solve_from_start: joints (m, n) from a start, and what is missing (m,).  near_joints: where to
@@ -134,7 +149,7 @@ def solve_joints_with_restarts(
     n, batch = len(lower), goal_poses.shape[:-2]
     goal = goal_poses.reshape(-1, 4, 4)
     if not len(goal):  # of which older SciPy makes no rotations
-        return np.zeros((*batch, n)), np.zeros(batch)
+        return InverseSolution(np.zeros((*batch, n)), np.zeros(batch))
     span = clip_range_near_zero(lower, upper)
     middle = np.clip(np.zeros(n), *span)
     begin = middle if near_joints is None else np.asarray(near_joints, dtype=float)
@@ -147,4 +162,4 @@ def solve_joints_with_restarts(
         other, missed = solve_from_start(goal[todo], rng.uniform(*span, (len(todo), n)))
         better = missed < left[todo]
         q[todo[better]], left[todo[better]] = other[better], missed[better]
-    return q.reshape(*batch, n), left.reshape(batch)
+    return InverseSolution(q.reshape(*batch, n), left.reshape(batch))

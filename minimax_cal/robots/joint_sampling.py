@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from minimax_cal.core.arrays import Array
-from minimax_cal.robots.joint_ranges import DEFAULT_SLIDE_RANGE, clip_range_near_zero
+from minimax_cal.robots.joint_ranges import DEFAULT_SLIDE_RANGE, JointBounds, clip_range_near_zero
 from minimax_cal.robots.robot import Robot
 
 
-def sampling_range(robot: Robot, max_joint_angle: float = np.pi) -> tuple[Array, Array]:
+def sampling_range(robot: Robot, max_joint_angle: float = np.pi) -> JointBounds:
     """(n,) lowest and highest joint values: the limits, at most one turn [rad, m].
 
     max_joint_angle: most that a joint turns from 0 [rad], where it comes there.

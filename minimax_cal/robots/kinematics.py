@@ -8,6 +8,7 @@ stand for a batch of robots.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -88,14 +89,21 @@ def targets_in_base(links: LinkFrames, targets: Array) -> Array:
     return plain.targets_in_base(links.axes, links.origin, targets)
 
 
-def screw_axes_and_moments(links: LinkFrames) -> tuple[Array, Array]:
+class ScrewAxes(NamedTuple):
+    """Axes and moments (..., 3n, 3, m) of turns by theta, then alpha, then beta."""
+
+    axes: Array
+    moments: Array
+
+
+def screw_axes_and_moments(links: LinkFrames) -> ScrewAxes:
     """Axis w and moment o x w of all theta, then alpha, then beta: (..., 3n, 3, m) each.
 
     A point p moves by ``(o x w) - (p x w) = w x (p - o)`` per radian about the axis w through o.
     """
     axis = np.concatenate([links.z, links.x, links.y], axis=-3)
     through = np.concatenate([links.before, links.after, links.after], axis=-3)
-    return axis, cross(through, axis)
+    return ScrewAxes(axis, cross(through, axis))
 
 
 def skew_matrix(vector: Array) -> Array:
@@ -148,7 +156,14 @@ def rotation_to_quaternion(rotation: Array) -> Array:
     return np.asarray(every / np.linalg.norm(every))
 
 
-def rotation_to_unnormalised_quaternion(rotation: Array) -> tuple[Array, float]:
+class UnnormalisedQuaternion(NamedTuple):
+    """Vector (3,) and scalar of a quaternion of any length."""
+
+    vector: Array
+    scalar: float
+
+
+def rotation_to_unnormalised_quaternion(rotation: Array) -> UnnormalisedQuaternion:
     """Vector (3,) and scalar of the quaternion of a rotation (3, 3), of any length.
 
     From its largest entry [Shepperd 1978].
@@ -172,4 +187,5 @@ def rotation_to_unnormalised_quaternion(rotation: Array) -> tuple[Array, float]:
         v[i] = 1.0 + rotation[i, i] - rotation[j, j] - rotation[k, k]
         v[j], v[k] = rotation[j, i] + rotation[i, j], rotation[k, i] + rotation[i, k]
         w = rotation[k, j] - rotation[j, k]
-    return (-v, -float(w)) if w < 0.0 else (v, float(w))
+    sign = -1.0 if w < 0.0 else 1.0
+    return UnnormalisedQuaternion(sign * v, sign * float(w))

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -36,6 +36,7 @@ from minimax_cal.robots.inverse_kinematics import (
     solve_joints_with_restarts,
     solve_nearest_joints,
 )
+from minimax_cal.robots.joint_ranges import JointBounds
 from minimax_cal.robots.kinematics import MDH_NAMES
 from minimax_cal.robots.transforms import a_alpha_beta_transform
 
@@ -362,9 +363,16 @@ class Robot:
         return replace(self, mdh=new)
 
 
+class PosesAndStart(NamedTuple):
+    """Goal poses (..., 4, 4), and joint values to start from."""
+
+    poses: Array
+    near_joints: Array | None
+
+
 def check_poses_and_start(
     poses: Array, near_joints: Array | None, joint_count: int
-) -> tuple[Array, Array | None]:
+) -> PosesAndStart:
     """Poses (..., 4, 4) and joints to start from, if they are some.  Raises RobotError."""
     try:
         poses = np.asarray(poses, dtype=float)
@@ -388,7 +396,7 @@ def check_poses_and_start(
                 f",) or a row for each pose; it is "
                 f"{near_joints.shape}"
             )
-    return poses, near_joints
+    return PosesAndStart(poses, near_joints)
 
 
 def warn_of_unreached_poses(q: Array, residuals: Array) -> Array:
@@ -496,7 +504,7 @@ def build_link_rows(schema: RobotSchema, unit_scales: Array, source: str) -> Arr
 
 def build_joint_limits(
     schema: RobotSchema, prismatic: Array, joint_units: Array, source: str
-) -> tuple[Array, Array]:
+) -> JointBounds:
     """Lower and upper limits (n,), infinite where unknown [rad, m].  Raises RobotError."""
     lower = fill_missing_numbers([j.lower for j in schema.joints], -np.inf)
     upper = fill_missing_numbers([j.upper for j in schema.joints], np.inf)
@@ -504,7 +512,7 @@ def build_joint_limits(
     if np.any(lower >= upper):
         number = int(np.argmax(lower >= upper)) + 1
         raise RobotError(f"{source}: joint {number}: lower must be less than upper")
-    return lower * joint_units, upper * joint_units
+    return JointBounds(lower * joint_units, upper * joint_units)
 
 
 def build_up_vector(schema: RobotSchema, source: str) -> Array:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -171,18 +171,33 @@ def link_row_to_axis(axis_point: Array, axis_direction: Array) -> Array:
     return np.array([a, d, theta, np.arctan2(-(w @ y), w[2]), 0.0])
 
 
-def equivalent_a_theta_within_quarter_turn(a: float, theta: float) -> tuple[float, float]:
+class OffsetAndTurn(NamedTuple):
+    """An offset a [m] and an angle theta [rad] of a link."""
+
+    a: float
+    theta: float
+
+
+def equivalent_a_theta_within_quarter_turn(a: float, theta: float) -> OffsetAndTurn:
     """The same offset with theta within a quarter turn, a negative if need be."""
     quarter = np.pi / 2
     if abs(theta) > quarter + 1e-6 or (abs(theta) > quarter - 1e-6 and a < -1e-9):
-        return -a, float(theta - np.copysign(np.pi, theta))
-    return a, theta
+        return OffsetAndTurn(-a, float(theta - np.copysign(np.pi, theta)))
+    return OffsetAndTurn(a, theta)
 
 
-def alpha_beta_for_z_axis(z_axis: Array) -> tuple[float, float]:
+class AlphaBeta(NamedTuple):
+    """The angles of Rx(alpha) Ry(beta) [rad]."""
+
+    alpha: float
+    beta: float
+
+
+def alpha_beta_for_z_axis(z_axis: Array) -> AlphaBeta:
     """alpha and beta with Rx(alpha) Ry(beta) z = v."""
-    return float(np.arctan2(-z_axis[1], z_axis[2])), float(
-        np.arctan2(z_axis[0], np.hypot(z_axis[1], z_axis[2]))
+    return AlphaBeta(
+        float(np.arctan2(-z_axis[1], z_axis[2])),
+        float(np.arctan2(z_axis[0], np.hypot(z_axis[1], z_axis[2]))),
     )
 
 
@@ -286,9 +301,16 @@ class Frame:
         return {name: list(value) for name, value in vars(self).items()}
 
 
-def build_frame_tables(frames: Mapping[str, Frame], title: str) -> tuple[Table, Table]:
+class FrameTables(NamedTuple):
+    """Tables of frames, by X, Y, Z and A, B, C, and by quaternions and rotation vectors."""
+
+    angles: Table
+    quaternions: Table
+
+
+def build_frame_tables(frames: Mapping[str, Frame], title: str) -> FrameTables:
     """Frames by their names as X, Y, Z and A, B, C, and as quaternions and rotation vectors."""
-    return (
+    return FrameTables(
         Table.from_rows(
             f"{title}; {ABC_ANGLES_CONVENTION}",
             [(name, *frame.xyz_mm, *frame.abc_deg) for name, frame in frames.items()],

@@ -10,6 +10,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import NamedTuple
 from xml.parsers import expat
 
 import numpy as np
@@ -277,16 +278,24 @@ def parse_mimic(element: XmlElement | None, description: str, source: str) -> Mi
     return Mimic(required_attribute(element, "joint", source), multiplier, offset)
 
 
-def parse_link_mass(element: XmlElement, name: str, source: str) -> tuple[float, Array]:
+class LinkMass(NamedTuple):
+    """Mass of a link [kg], and its centre of gravity (3,) in the link's frame [m]."""
+
+    mass: float
+    centre: Array
+
+
+def parse_link_mass(element: XmlElement, name: str, source: str) -> LinkMass:
     """Mass [kg] and centre of gravity in the link's frame [m]; mass 0 where none is given."""
     inertial, where = element.first_child("inertial"), f"link {name!r}"
     if inertial is None or ASSUMED_MASS_ATTRIBUTE in inertial.attributes:
-        return 0.0, np.zeros(3)
+        return LinkMass(0.0, np.zeros(3))
     mass = float(attribute_numbers(inertial.first_child("mass"), "value", (0.0,), where, source)[0])
     if mass < 0.0:
         raise RobotError(f"{source}:{inertial.line}: {where}: a mass below zero")
-    return mass, attribute_numbers(
-        inertial.first_child("origin"), "xyz", (0.0, 0.0, 0.0), where, source
+    return LinkMass(
+        mass,
+        attribute_numbers(inertial.first_child("origin"), "xyz", (0.0, 0.0, 0.0), where, source),
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -407,18 +407,34 @@ def load_urdf(source: Path | str) -> UrdfRobot:
     return convert_urdf_to_robot(read_urdf(name), tip)
 
 
-def split_root_and_tip(tip_text: str, link_names: Iterable[str]) -> tuple[str, str]:
+class ChainEnds(NamedTuple):
+    """Names of the first and the last link of a chain, '' where none is named."""
+
+    root: str
+    tip: str
+
+
+def split_root_and_tip(tip_text: str, link_names: Iterable[str]) -> ChainEnds:
     """The root, empty where none is named, and the tip of ``root:tip``; names may hold colons."""
     names = {*link_names}
     ways = [(tip_text[:at], tip_text[at + 1 :]) for at, mark in enumerate(tip_text) if mark == ":"]
     whole = [("", tip_text)] if tip_text in names or not ways else []
-    return [*whole, *(way for way in ways if {*way} <= names), *ways[::-1]][0]
+    return ChainEnds(*[*whole, *(way for way in ways if {*way} <= names), *ways[::-1]][0])
 
 
-def split_file_and_link_names(source: Path | str) -> tuple[str, str]:
+class FileAndLinkNames(NamedTuple):
+    """A file's path, and the text after its #."""
+
+    file: str
+    link_names: str
+
+
+def split_file_and_link_names(source: Path | str) -> FileAndLinkNames:
     """The file and the links that a robot's name means."""
     name, mark, tip = str(source).rpartition("#")
-    return (name, tip) if mark and not Path(source).exists() else (str(source), "")
+    if mark and not Path(source).exists():
+        return FileAndLinkNames(name, tip)
+    return FileAndLinkNames(str(source), "")
 
 
 def is_urdf_source(source: Path | str) -> bool:

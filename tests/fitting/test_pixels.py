@@ -40,7 +40,7 @@ from minimax_cal.fitting.pixels.pixel_start import (
 from minimax_cal.instruments.camera_images import CameraImages, TargetSight
 from minimax_cal.instruments.camera_model import (
     FITTED_INTRINSICS,
-    pixels_and_derivatives,
+    pixel_derivatives,
     project_to_pixels,
     undistort_pixels,
 )
@@ -99,7 +99,7 @@ def test_slopes_are_the_derivatives_of_the_projection():
     rng, step = np.random.default_rng(0), 1e-30
     x, y = rng.uniform(-0.4, 0.4, (2, 30))
     lens = LENS[:, None]
-    pixel, by, own = pixels_and_derivatives(lens, x, y)
+    pixel, by, own = pixel_derivatives(lens, x, y)
     assert_allclose(pixel, project_to_pixels(lens, x, y), rtol=0, atol=EXACT)
     assert_allclose(by[0], project_to_pixels(lens, x + 1j * step, y + 0j).imag / step, rtol=1e-12)
     assert_allclose(by[1], project_to_pixels(lens, x + 0j, y + 1j * step).imag / step, rtol=1e-12)

@@ -48,11 +48,11 @@ def clipped(data: mc.Measurements) -> mc.Measurements:
 
 SLIPS: dict[str, tuple[Callable[[mc.Measurements], mc.Measurements], str]] = {
     "shifted": (
-        lambda d: file_mistakes.with_points_shifted_by_rows(d, 1),
+        lambda d: file_mistakes.with_points_from_rows_ahead(d, 1),
         "one row above its joints; .*shift=-1 -o",
     ),
     "by three": (
-        lambda d: file_mistakes.with_points_shifted_by_rows(d, -3),
+        lambda d: file_mistakes.with_points_from_rows_ahead(d, -3),
         "three rows below .*--mend shift=3 -o",
     ),
     "reversed": (file_mistakes.with_points_reversed, "in reverse order; .*--mend reverse -o"),

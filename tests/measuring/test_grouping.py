@@ -32,7 +32,7 @@ from minimax_cal.measuring.visit_history import (
     add_history_columns,
     has_visit_order,
     joint_moves,
-    list_time_notices,
+    list_backward_time_notices,
 )
 from minimax_cal.modelling.simulate import Truth, simulate
 
@@ -366,12 +366,14 @@ def test_irb120_keeps_the_moves_whose_start_is_in_the_file():
 def test_a_clock_against_the_order_is_told():
     order, time = np.arange(4.0), np.array([0.0, 2.0, 1.0, np.nan])
     q = [0.0, 1.0, 2.0, 3.0]
-    (said,) = list_time_notices(walk(q, order=order, time=time))
+    (said,) = list_backward_time_notices(walk(q, order=order, time=time))
     assert ":3: column time_s runs backwards against the column order, 1 times" in said
-    assert list_time_notices(walk(q, order=order[::-1], time=-order)) == []
+    assert list_backward_time_notices(walk(q, order=order[::-1], time=-order)) == []
     days = np.array(["a", "a", "b", "b"])
-    assert list_time_notices(walk(q, time=np.array([5.0, 6.0, 1.0, 2.0]), session=days)) == []
-    assert list_time_notices(walk(q, order=order)) == []
+    assert (
+        list_backward_time_notices(walk(q, time=np.array([5.0, 6.0, 1.0, 2.0]), session=days)) == []
+    )
+    assert list_backward_time_notices(walk(q, order=order)) == []
 
 
 # ---- order untold --------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -62,9 +63,17 @@ def find_faults_by_distances(data: Measurements) -> tuple[DataFault, ...]:
     return (*shifts, *find_outliers(good, apart, shift_faults=shifts))
 
 
+class RestoredTargetNames(NamedTuple):
+    """Rows found under other targets' names, the data with names corrected, and its distances."""
+
+    faults: tuple[DataFault, ...]
+    data: Measurements
+    distances: TargetDistances
+
+
 def restore_target_names(
     data: Measurements, point_errors: Array = NO_POINT_ERRORS
-) -> tuple[tuple[DataFault, ...], Measurements, TargetDistances]:
+) -> RestoredTargetNames:
     """Rows under other names, the data with these put right, and the distances of those data.
 
     point_errors: (m, k, 3) as `find_data_faults` takes it [m].
@@ -72,7 +81,7 @@ def restore_target_names(
     apart = measure_target_distances(data)
     swapped = find_swapped_target_rows(data, apart, point_errors)
     good = correct_faults(data, swapped)
-    return swapped, good, measure_target_distances(good) if swapped else apart
+    return RestoredTargetNames(swapped, good, measure_target_distances(good) if swapped else apart)
 
 
 def find_outlier_faults(data: Measurements, point_errors: Array) -> tuple[DataFault, ...]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
@@ -347,9 +348,16 @@ def find_swapped_target_rows(
     )
 
 
+class BestTargetOrder(NamedTuple):
+    """The target (k,) that each point of a row is of, and the squared standard deviation left."""
+
+    target_order: Array
+    squared_deviation: float
+
+
 def find_best_target_order(
     points: Array, distances: TargetDistances, predicted: Array
-) -> tuple[Array, float]:
+) -> BestTargetOrder:
     """Where each target of a row seems to stand, and the squared deviation left over.
 
     points: (k, 3) [m].  predicted: (k, 3), zeros for unknown [m].  Of orders that fit alike (a
@@ -359,7 +367,7 @@ def find_best_target_order(
     seen = np.flatnonzero(np.isfinite(points[:, 0]))
     count = len(seen)
     if count < 3:
-        return np.arange(k), np.inf
+        return BestTargetOrder(np.arange(k), np.inf)
     found: list[tuple[float, float, Array]] = []
     for some in list_target_orders(count):
         order = np.arange(k)
@@ -374,10 +382,17 @@ def find_best_target_order(
         found.append((cost, miss if predicted.any() else changed, order))
     least = min(cost for cost, _, _ in found)
     alike = [entry for entry in found if entry[0] < least + 4.0 * count]
-    return min(alike, key=lambda entry: entry[1])[2], least
+    return BestTargetOrder(min(alike, key=lambda entry: entry[1])[2], least)
 
 
-def estimate_noise_from_distances(data: Measurements) -> tuple[float, float] | None:
+class NoiseEstimate(NamedTuple):
+    """Noise of a coordinate [m], and its relative standard error."""
+
+    sigma: float
+    relative_error: float
+
+
+def estimate_noise_from_distances(data: Measurements) -> NoiseEstimate | None:
     """Noise of a coordinate [m] by the targets' distances, and its relative standard error.
 
     None where too few were measured together.  Steps of nests are taken out; a few points that are
@@ -390,7 +405,7 @@ def estimate_noise_from_distances(data: Measurements) -> tuple[float, float] | N
         return None
     many = float(np.isfinite(apart.off).sum(axis=1).max())
     sigma = np.sqrt(0.5 * np.mean(apart.sigma**2))  # of a distance: root 2 of a coordinate's
-    return float(sigma), RELATIVE_ERROR_OF_MEDIAN / np.sqrt(many)
+    return NoiseEstimate(float(sigma), RELATIVE_ERROR_OF_MEDIAN / np.sqrt(many))
 
 
 def find_misdeclared_noise(data: Measurements) -> tuple[DataFault, ...]:

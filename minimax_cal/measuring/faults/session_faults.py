@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import fdtrc
@@ -47,9 +48,17 @@ def find_mixed_unit_sessions(data: Measurements) -> tuple[DataFault, ...]:
     )
 
 
+class SessionUnitRatio(NamedTuple):
+    """What two sessions give in different units, which units, and the ratio of their numbers."""
+
+    quantity: str
+    unit_pair: str
+    ratio: float
+
+
 def find_session_unit_ratios(
     data: Measurements, first_rows: Array, other_rows: Array
-) -> Iterator[tuple[str, str, float]]:
+) -> Iterator[SessionUnitRatio]:
     """What two sessions give in different units, and how far apart."""
     size = [
         float(np.nanmedian(np.linalg.norm(data.y[s], axis=-1))) for s in (first_rows, other_rows)
@@ -58,7 +67,7 @@ def find_session_unit_ratios(
     for factor, word in ((1e3, "metres and millimetres"), (25.4, "inches and millimetres")):
         for f in (factor, 1.0 / factor):
             if abs(np.log(ratio / f)) < 0.5:
-                yield "points", word, ratio
+                yield SessionUnitRatio("points", word, ratio)
     turning = ~data.sliding
     if turning.any():
         wide = [
@@ -68,7 +77,7 @@ def find_session_unit_ratios(
         if max(wide) > 4.0 * np.pi and min(wide) > 0.0:
             ratio = wide[1] / wide[0]
             if min(ratio, 1.0 / ratio) < 0.1:
-                yield "joint values", "radians and degrees", ratio
+                yield SessionUnitRatio("joint values", "radians and degrees", ratio)
 
 
 def find_session_jumps(
@@ -107,7 +116,14 @@ def find_session_jumps(
     )
 
 
-def locate_frame_jumps(data: Measurements, point_errors: Array) -> tuple[Array, Array]:
+class FrameJumps(NamedTuple):
+    """Rows (j,) from which on all targets have moved as one body, and how far (j,) [m]."""
+
+    rows: Array
+    sizes: Array
+
+
+def locate_frame_jumps(data: Measurements, point_errors: Array) -> FrameJumps:
     """Rows (j,) from which on, as visited, all targets have moved as one body, and how far [m].
 
     The mean errors of the poses' targets are explained by one small displacement (6) for all, or by
@@ -128,10 +144,10 @@ def locate_frame_jumps(data: Measurements, point_errors: Array) -> tuple[Array, 
     )
     starts = find_jump_poses(poses, len(begins))
     if not starts:
-        return NO_FAULT_ROWS, np.zeros(0)
+        return FrameJumps(NO_FAULT_ROWS, np.zeros(0))
     steps = [poses.fit_displacement(a, b) for a, b in pairwise([0, *starts, len(begins)])]
     sizes = [poses.rms_motion(later - earlier) for earlier, later in pairwise(steps)]
-    return order[begins[np.array(starts, dtype=int)]], np.array(sizes)
+    return FrameJumps(order[begins[np.array(starts, dtype=int)]], np.array(sizes))
 
 
 def find_pose_starts(data: Measurements, visit_rows: Array) -> Array:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtri, ndtri
@@ -159,7 +160,14 @@ def locate_step(deviations: Array, changes: Array, sigmas: Array, first_guess: i
     return low + int(before[low - 1 : high].argmin())
 
 
-def scan_for_steps(values: Array) -> tuple[Array, Array]:
+class StepScan(NamedTuple):
+    """Squared standard score (p,) of each series' best step, the first entry (p,) after it."""
+
+    squared_scores: Array
+    first_entries_after: Array
+
+
+def scan_for_steps(values: Array) -> StepScan:
     """Largest squared standard score of a step in each series, and the first entry after it.
 
     By ranks, so that no outlier counts for more than one visit; and by clipped standard scores,
@@ -168,7 +176,7 @@ def scan_for_steps(values: Array) -> tuple[Array, Array]:
     (strength, first), (other, late) = (
         step_strengths(f(values)) for f in (normal_scores_of_ranks, clipped_standard_scores)
     )
-    return np.maximum(strength, other), np.where(strength >= other, first, late)
+    return StepScan(np.maximum(strength, other), np.where(strength >= other, first, late))
 
 
 def normal_scores_of_ranks(values: Array) -> Array:
@@ -203,7 +211,7 @@ def clipped_standard_scores(values: Array) -> Array:
     return np.asarray(score - score.mean(axis=1, keepdims=True))
 
 
-def step_strengths(scores: Array) -> tuple[Array, Array]:
+def step_strengths(scores: Array) -> StepScan:
     """(p,) squared standard score of the best step in scores (p, m), and the first entry after it.
 
     Less where neighbours are alike; 0 where a steady drift explains the series as well.
@@ -221,7 +229,7 @@ def step_strengths(scores: Array) -> tuple[Array, Array]:
     wider = (1.0 + alike) / np.maximum(1.0 - alike, 1e-3)
     time = np.linspace(-1.0, 1.0, m)
     drift, strength = (scores @ time) ** 2 / (time @ time), gain.max(axis=1)
-    return np.where(strength - drift < 0.1 * strength, 0.0, strength / wider), first
+    return StepScan(np.where(strength - drift < 0.1 * strength, 0.0, strength / wider), first)
 
 
 def build_shift_fault(

@@ -6,6 +6,7 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import count
+from typing import NamedTuple
 
 import numpy as np
 
@@ -88,15 +89,22 @@ class ImportAssembly:
     matched: tuple[str, ...]
 
 
-def find_column_unit(column: ImportedColumn, options: ImportOptions) -> tuple[str, str]:
+class ColumnUnit(NamedTuple):
+    """A unit, '' where unknown, and how it is known."""
+
+    unit: str
+    source: str
+
+
+def find_column_unit(column: ImportedColumn, options: ImportOptions) -> ColumnUnit:
     """A column's unit and how it is known; '' where it is not."""
     for name in (column.meaning, column.meaning.partition("_")[0], column.family):
         if name in options.units:
             also = f", though {column.known} says {column.unit}" if column.unit else ""
-            return options.units[name], "given" + (
-                also if column.unit != options.units[name] else ""
+            return ColumnUnit(
+                options.units[name], "given" + (also if column.unit != options.units[name] else "")
             )
-    return column.unit, column.known
+    return ColumnUnit(column.unit, column.known)
 
 
 def find_shared_unit(
@@ -232,12 +240,19 @@ def set_aside_deleted_points(
     )
 
 
+class RawMeasurements(NamedTuple):
+    """Joints and points of files, and the units that were decided for them."""
+
+    data: Measurements
+    units: ImportUnits
+
+
 def build_raw_measurements(
     parts: Sequence[ImportPart],
     placements: Sequence[PointPlacement],
     joint_table: ImportedTable,
     options: ImportOptions,
-) -> tuple[Measurements, ImportUnits]:
+) -> RawMeasurements:
     """The numbers of joints and points, their units decided.  Raises DataError."""
     points = [part.reading for part in parts]
     q_units = [find_column_unit(column, options)[0] for column in joint_table.joint_columns]
@@ -270,9 +285,12 @@ def build_raw_measurements(
     scales = ImportUnits(*decide_units(q, y, q_unit, "m" if mixed else y_unit, sliding, where))
     scale = [METRES_PER_LENGTH_UNIT.get(unit, RADIANS_PER_ANGLE_UNIT[scales.q]) for unit in q_units]
     targets = tuple(name for part in parts for names in part.targets.values() for name in names)
-    return Measurements(
-        q * scale, y * METRES_PER_LENGTH_UNIT[scales.y], targets, sliding, joint_table.line, {}
-    ), scales
+    return RawMeasurements(
+        Measurements(
+            q * scale, y * METRES_PER_LENGTH_UNIT[scales.y], targets, sliding, joint_table.line, {}
+        ),
+        scales,
+    )
 
 
 def ignore_points_of_joint_table(joint_table: ImportedTable) -> ImportedTable:
@@ -285,9 +303,17 @@ def ignore_points_of_joint_table(joint_table: ImportedTable) -> ImportedTable:
     return replace(joint_table, columns=columns)
 
 
+class GatheredColumns(NamedTuple):
+    """Columns that something uses, columns that are only kept, and the meanings in each file."""
+
+    used: dict[str, Array]
+    kept: dict[str, Array]
+    meanings: tuple[tuple[ColumnMeaning, ...], ...]
+
+
 def gather_optional_columns(
     parts: Sequence[ImportPart], options: ImportOptions, units: ImportUnits, pose_count: int
-) -> tuple[dict[str, Array], dict[str, Array], tuple[tuple[ColumnMeaning, ...], ...]]:
+) -> GatheredColumns:
     """Columns that something uses, columns that are only kept, and the meanings in each file."""
     columns: dict[str, Array] = {}
     unknown: dict[str, Array] = {}
@@ -314,7 +340,7 @@ def gather_optional_columns(
         meanings.append(tuple(mine))
     if any(meaning.known.startswith(TIME_STAMPS_TEXT) for mine in meanings for meaning in mine):
         columns["time"] = columns["time"] - np.nanmin(columns["time"])
-    return columns, unknown, tuple(meanings)
+    return GatheredColumns(columns, unknown, tuple(meanings))
 
 
 def name_targets_of_files(
@@ -411,9 +437,17 @@ def interpret_column(
     return ColumnMeaning(column, "left out", "", known)
 
 
+class OptionalColumnValues(NamedTuple):
+    """Numbers (m,) of a column in SI, its first cell, and how its unit is known."""
+
+    values: Array
+    first_cell: str
+    unit_source: str
+
+
 def interpret_optional_column(
     table: ImportedTable, column: ImportedColumn, unit: str, unit_source: str
-) -> tuple[Array, str, str]:
+) -> OptionalColumnValues:
     """An optional column of numbers in SI, its first, and how its unit is known.
 
     Raises DataError where it needs a unit and has none.
@@ -429,9 +463,9 @@ def interpret_optional_column(
         )
     values = table.column_numbers(column) * factors.get(unit, 1.0)
     if not np.isfinite(values).any():
-        return NO_COLUMN_VALUES, "", "empty"
+        return OptionalColumnValues(NO_COLUMN_VALUES, "", "empty")
     si = f"{values[0]:.6g}" + (" rad" if family == "qread" else " m" if factors else "")
-    return values, si, unit_source
+    return OptionalColumnValues(values, si, unit_source)
 
 
 def convert_row_values_to_poses(

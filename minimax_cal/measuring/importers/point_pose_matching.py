@@ -10,6 +10,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -102,16 +103,23 @@ def try_name_patterns(point_names: Sequence[str], pose_names: Sequence[str]) -> 
         )
 
 
+class PoseRowAndTarget(NamedTuple):
+    """Row of a pose, -1 where none is found, and the label of a target."""
+
+    pose_row: int
+    target_label: str
+
+
 def find_pose_row_and_target_label(
     name_parts: NameParts, row_by_pose_name: Mapping[NameParts, int], is_target_last: bool
-) -> tuple[int, str]:
+) -> PoseRowAndTarget:
     """The pose's row and the target, where the target's name comes last, or first."""
     for size in range(1, min(MAX_TARGET_NAME_PARTS, len(name_parts) - 1) + 1):
         cut = len(name_parts) - size if is_target_last else size
         ends = name_parts[:cut], name_parts[cut:]
         if (row := row_by_pose_name.get(ends[not is_target_last], -1)) >= 0:
-            return row, "".join(map(str, ends[is_target_last]))
-    return -1, ""
+            return PoseRowAndTarget(row, "".join(map(str, ends[is_target_last])))
+    return PoseRowAndTarget(-1, "")
 
 
 def match_names_by_number(
@@ -180,28 +188,38 @@ class PointPlacement:
     how: str
 
 
+class PlacedPoints(NamedTuple):
+    """Rows of points that have a pose, and where they go."""
+
+    table: ImportedTable
+    placement: PointPlacement
+
+
 def place_points_and_list_gaps(
     point_table: ImportedTable, joint_table: ImportedTable, layout: str
-) -> tuple[ImportedTable, PointPlacement]:
+) -> PlacedPoints:
     """Rows of points that have a pose, and where they go.  Raises DataError naming file and line.
 
     By names where both files have some, else by order.  What is missing is listed.
     """
     point_table, spot = place_points(point_table, joint_table, layout)
-    return point_table.with_notices(*list_missing_points(point_table, joint_table, spot)), spot
+    return PlacedPoints(
+        point_table.with_notices(*list_missing_points(point_table, joint_table, spot)), spot
+    )
 
 
 def place_points(
     point_table: ImportedTable, joint_table: ImportedTable, layout: str
-) -> tuple[ImportedTable, PointPlacement]:
+) -> PlacedPoints:
     """Rows of points and where they go."""
     if point_table is joint_table:
-        return point_table, place_points_by_target_name(
-            point_table, np.arange(len(point_table.line)), SAME_ROW
+        return PlacedPoints(
+            point_table,
+            place_points_by_target_name(point_table, np.arange(len(point_table.line)), SAME_ROW),
         )
     key, other = point_table.find_column("pose"), joint_table.find_column("pose")
     if not (key and other):
-        return point_table, place_points_by_order(point_table, joint_table, layout)
+        return PlacedPoints(point_table, place_points_by_order(point_table, joint_table, layout))
     check_unique_pose_names(joint_table, other)
     match = match_point_names_to_poses(key.cells, other.cells)
     if match is None:
@@ -210,8 +228,8 @@ def place_points(
             f"the joints in {joint_table.sheet.path} "
             f"({other.cells[0]} ...) have nothing in common: they are matched by order"
         )
-        return point_table.with_notices(said), place_points_by_order(
-            point_table, joint_table, layout
+        return PlacedPoints(
+            point_table.with_notices(said), place_points_by_order(point_table, joint_table, layout)
         )
     return place_points_by_name(point_table, joint_table, match)
 
@@ -267,7 +285,7 @@ def check_unique_pose_names(joint_table: ImportedTable, name_column: ImportedCol
 
 def place_points_by_name(
     point_table: ImportedTable, joint_table: ImportedTable, match: NameMatch
-) -> tuple[ImportedTable, PointPlacement]:
+) -> PlacedPoints:
     """Points where their names say; those without a pose left out."""
     rows = np.array(match.pose)
     kept = np.flatnonzero(rows >= 0)
@@ -292,7 +310,7 @@ def place_points_by_name(
         )
         point_table, kept, slot = point_table.take_rows(first), kept[first], slot[first]
     check_one_point_per_target(point_table, rows[kept], slot)
-    return point_table, PointPlacement(rows[kept], slot, own, match.how)
+    return PlacedPoints(point_table, PointPlacement(rows[kept], slot, own, match.how))
 
 
 def rows_without_repeats(
@@ -362,13 +380,20 @@ def resolve_deleted_points(
     return first
 
 
-def target_names_and_slots(point_table: ImportedTable) -> tuple[tuple[str, ...], Array]:
+class TargetSlots(NamedTuple):
+    """Names of targets in order of appearance, and (m,) the index of each row's target."""
+
+    names: tuple[str, ...]
+    slot_of_row: Array
+
+
+def target_names_and_slots(point_table: ImportedTable) -> TargetSlots:
     """Names of the targets in order of appearance, and (m,) the index of each row's."""
     column = point_table.find_column("target")
     if column is None or len(point_table.target_numbers) > 1:
-        return ("",), np.zeros(len(point_table.line), dtype=int)
+        return TargetSlots(("",), np.zeros(len(point_table.line), dtype=int))
     names = tuple(dict.fromkeys(column.cells))
-    return names, np.array([names.index(cell) for cell in column.cells])
+    return TargetSlots(names, np.array([names.index(cell) for cell in column.cells]))
 
 
 def place_points_by_target_name(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -156,9 +157,17 @@ PROGRAM_LANGUAGES = (
 )
 
 
+class ProgramWithTargets(NamedTuple):
+    """Language of a program, its joint targets, and its text without strings and comments."""
+
+    language: ProgramLanguage
+    targets: list[ProgramTarget]
+    bare_text: str
+
+
 def detect_language_and_targets(
     program_text: str,
-) -> tuple[ProgramLanguage, list[ProgramTarget], str] | None:
+) -> ProgramWithTargets | None:
     """The language of a program, its joint targets, and its text without strings and comments."""
     for language in PROGRAM_LANGUAGES:
         bare = replace_matches_with_spaces(program_text, language.aside)
@@ -166,7 +175,7 @@ def detect_language_and_targets(
         if len(found) >= language.least and (
             language.least == 1 or len({len(target.axes) for target in found}) == 1
         ):
-            return language, found, bare
+            return ProgramWithTargets(language, found, bare)
     return None
 
 

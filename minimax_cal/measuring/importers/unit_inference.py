@@ -9,6 +9,7 @@ from __future__ import annotations
 from datetime import datetime
 from itertools import product
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -155,9 +156,16 @@ def max_lever_ratio(q: Array, y: Array, sliding_joints: Array) -> float:
     return float(ratio.max()) if len(ratio) else float("nan")
 
 
+class TimeColumn(NamedTuple):
+    """Times (m,) [s], NaN where empty, and how they are known."""
+
+    seconds: Array
+    source: str
+
+
 def parse_time_column(
     table: ImportedTable, column: ImportedColumn, unit_or_date_order: str
-) -> tuple[Array, str]:
+) -> TimeColumn:
     """(m,) seconds, NaN where empty, and how they are known; of stamps, since 1900.
 
     An empty array and a remark, where the column tells no time.  unit_or_date_order: a unit (s,
@@ -166,7 +174,7 @@ def parse_time_column(
     cells = [cell.strip().lstrip("'").replace(",", ".") for cell in column.cells]
     filled = [cell for cell in cells if cell]
     if len(set(filled)) < 2:
-        return np.empty(0), "the same in all rows"
+        return TimeColumn(np.empty(0), "the same in all rows")
     if (
         unit := unit_or_date_order
         if unit_or_date_order in COLUMN_SECONDS_PER_TIME_UNIT
@@ -174,9 +182,10 @@ def parse_time_column(
     ):
         if unit not in COLUMN_SECONDS_PER_TIME_UNIT:
             raise DataError(f"{table.sheet.path}: column {column.name}: {unit} is no unit of time")
-        return table.column_numbers(column) * COLUMN_SECONDS_PER_TIME_UNIT[
-            unit
-        ], "given" if unit_or_date_order else column.known
+        return TimeColumn(
+            table.column_numbers(column) * COLUMN_SECONDS_PER_TIME_UNIT[unit],
+            "given" if unit_or_date_order else column.known,
+        )
     found: dict[tuple[float, ...], tuple[Array, str]] = {}
     for order, days in DATE_FORMATS_BY_ORDER.items():
         if unit_or_date_order and unit_or_date_order != order:
@@ -192,7 +201,7 @@ def parse_time_column(
         stamps, form = next(iter(found.values()))
         if np.nanmax(stamps) < SECONDS_PER_DAY:  # a clock without a date
             stamps = unwrap_clock_at_midnight(table, column, stamps)
-        return stamps, f"{TIME_STAMPS_TEXT} {form}"
+        return TimeColumn(stamps, f"{TIME_STAMPS_TEXT} {form}")
     if found:
         raise DataError(
             f"{table.sheet.path}: column {column.name}: {filled[0]} may be day or month first; "
@@ -203,7 +212,9 @@ def parse_time_column(
             f"{table.sheet.path}: column {column.name}: {filled[0]!r}"
             f" is not a time as {unit_or_date_order}"
         )
-    return np.empty(0), "no time stamps that are understood; if seconds, add units='time=s'"
+    return TimeColumn(
+        np.empty(0), "no time stamps that are understood; if seconds, add units='time=s'"
+    )
 
 
 def unwrap_clock_at_midnight(table: ImportedTable, column: ImportedColumn, clock: Array) -> Array:
@@ -250,13 +261,21 @@ def parse_time_stamps(cells: list[str], stamp_format: str) -> Array | None:
     return out
 
 
+class TemperatureColumn(NamedTuple):
+    """Temperatures (m,) [degrees Celsius], the unit of the file, and how it is known."""
+
+    celsius: Array
+    unit: str
+    source: str
+
+
 def parse_temperature_column(
     table: ImportedTable, column: ImportedColumn, given_unit: str
-) -> tuple[Array, str, str]:
+) -> TemperatureColumn:
     """(m,) temperatures in degrees Celsius, the unit found, and how.  Raises DataError."""
     values = table.column_numbers(column)
     if not np.isfinite(values).any():
-        return np.empty(0), "", "empty"
+        return TemperatureColumn(np.empty(0), "", "empty")
     unit, known = given_unit or column.unit, "given" if given_unit else column.known
     if not unit:
         low, high = np.nanmin(values), np.nanmax(values)
@@ -276,4 +295,4 @@ def parse_temperature_column(
             f"{table.sheet.path}: column {column.name}: {unit} is no unit of temperature"
         )
     factor, shift = CELSIUS_CONVERSIONS[unit]
-    return values * factor + shift, unit, known
+    return TemperatureColumn(values * factor + shift, unit, known)

@@ -15,6 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cache
 from types import ModuleType
+from typing import NamedTuple
 
 import numpy as np
 
@@ -124,7 +125,7 @@ class KernelColumns:
 
     def sum_normal_equations(
         self, kernel_module: ModuleType, state: KernelState, data: KernelData
-    ) -> tuple[Array, Array, Array]:
+    ) -> TargetNormalEquations:
         """See `sums.sum_normal_equations`."""
         B, k, p = len(state[0]), len(data[2]), len(self.which)
         out = np.zeros((B, k)), np.zeros((B, k, p)), np.zeros((B, k, p, p))
@@ -137,12 +138,20 @@ class KernelColumns:
             kernel_module.add_to_normal_equations(
                 *flat, self.which, *self.target_column_bounds, *out
             )
-        return out
+        return TargetNormalEquations(*out)
+
+
+class TargetNormalEquations(NamedTuple):
+    """Normal equations by target: F (B, k), J'We (B, k, p) and J'WJ (B, k, p, p)."""
+
+    costs: Array
+    gradients: Array
+    grams: Array
 
 
 def sum_normal_equations(
     kernel_module: ModuleType, state: KernelState, data: KernelData, parameter_indices: Array
-) -> tuple[Array, Array, Array]:
+) -> TargetNormalEquations:
     """Normal equations by target: F (B, k), J'We (B, k, p) and J'WJ (B, k, p, p).
 
     parameter_indices: (p,) the parameters, ascending, in the order of `Names`.
@@ -152,6 +161,13 @@ def sum_normal_equations(
     )
 
 
+class ErrorsWithJacobian(NamedTuple):
+    """Weighted errors (k, 3, c) of points, and their derivatives (k, p, 3, c)."""
+
+    errors: Array
+    jacobian: Array
+
+
 def weighted_errors_and_jacobian(
     kernel_module: ModuleType,
     state: KernelState,
@@ -159,7 +175,7 @@ def weighted_errors_and_jacobian(
     parameter_indices: Array,
     first_pose: int,
     end_pose: int,
-) -> tuple[Array, Array]:
+) -> ErrorsWithJacobian:
     """Weighted errors (k, 3, c) of the poses lo to hi, and their Jacobian J (k, p, 3, c).
 
     In the axes of the flange, of a batch of one; the errors' derivative is -J.  As
@@ -174,7 +190,7 @@ def weighted_errors_and_jacobian(
     out[:, :s], out[:, end:] = J[0, :, :s], J[0, :, s:]
     t, axis = np.divmod(parameter_indices[s:end] - first, 3)
     out[t, np.arange(s, end), axis] = root[t]
-    return error[0], out
+    return ErrorsWithJacobian(error[0], out)
 
 
 def sum_gradients(
@@ -206,9 +222,16 @@ def sum_gradients(
     return out
 
 
+class DistancesWithGradients(NamedTuple):
+    """Weighted squared distances (k, m) [m^2], and their derivatives (k, m, p)."""
+
+    squared_distances: Array
+    gradients: Array
+
+
 def squared_distances_and_gradients(
     kernel_module: ModuleType, state: KernelState, data: KernelData, parameter_indices: Array
-) -> tuple[Array, Array]:
+) -> DistancesWithGradients:
     """Weighted squared distance of every point (k, m) [m^2] and its derivative (k, m, p).
 
     Of a batch of one, as `sum_normal_equations`.
@@ -224,7 +247,15 @@ def squared_distances_and_gradients(
         f[:, lo:hi], slope[:, lo:hi] = kernel_module.squared_errors_and_gradients(
             error[0], J[0], root, parameter_indices, *ends
         )
-    return f, slope
+    return DistancesWithGradients(f, slope)
+
+
+class DescentResult(NamedTuple):
+    """The state after Gauss-Newton steps, sums of squares (B, k) [m^2], whether it converged."""
+
+    state: KernelState
+    costs: Array
+    has_converged: bool
 
 
 def descend_by_gauss_newton(
@@ -235,7 +266,7 @@ def descend_by_gauss_newton(
     prior: tuple[Array, Array],
     min_point_motion: float,
     max_steps: int,
-) -> tuple[KernelState, Array, bool]:
+) -> DescentResult:
     """Plain Gauss-Newton steps from a start that is near: the sum of all F_i, and a prior.
 
     As `sum_normal_equations`, for a batch of one.  prior: mean and weight (p,) of
@@ -258,11 +289,11 @@ def descend_by_gauss_newton(
             or not np.isfinite(before)
             or not told
         ):
-            return state, np.array(costs[1:]), False
+            return DescentResult(state, np.array(costs[1:]), False)
         state = kernel_module.apply_parameter_step(*state, parameter_indices, dx)
         if gain <= count * min_point_motion**2:
-            return state, np.array([*costs[1:], before - gain]), True
-    return state, np.array(costs[1:]), False
+            return DescentResult(state, np.array([*costs[1:], before - gain]), True)
+    return DescentResult(state, np.array(costs[1:]), False)
 
 
 def select_parameter_values(state: KernelState, parameter_indices: Array) -> Array:
