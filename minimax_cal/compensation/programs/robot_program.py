@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import starmap
 from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
@@ -199,7 +200,7 @@ class RobotProgram:
             else:
                 new = self.language.format_pose_numbers(pose, point)
                 changes += self.language.list_configuration_changes(point, old, q)
-            changes += map(NumberEdit, point.pose_or_joint_numbers, new)
+            changes += starmap(NumberEdit, zip(point.pose_or_joint_numbers, new, strict=True))
         return self.text.replace_numbers(changes).encode("latin-1")
 
 
