@@ -38,7 +38,8 @@ from minimax_cal.robots.inverse_kinematics import (
 )
 from minimax_cal.robots.joint_ranges import JointBounds
 from minimax_cal.robots.kinematics import MDH_NAMES
-from minimax_cal.robots.transforms import a_alpha_beta_transform
+from minimax_cal.robots.parallel_axes import move_frames_along_parallel_axes
+from minimax_cal.robots.transforms import a_alpha_beta_transform, axis_rotation
 
 STANDARD_DH_FORMULA = DH_FORMULAS["standard"]
 METRES_PER_UNIT = {"mm": 1e-3, "m": 1.0}
@@ -447,6 +448,18 @@ def robot_from_dict(content: Mapping[str, Any], source: str = "robot") -> Robot:
     else:
         mdh, sign = dh_notation.apply_offsets_and_half_turn(mdh, sign, prismatic, offset, False)
         said = DhNotation(offset=offset) if len(offset) else STANDARD_NOTATION
+    moved = move_frames_along_parallel_axes(mdh)
+    if moved.shifts.any():
+        mdh = moved.mdh
+        turns = [axis_rotation(2, turn)[:3, :3] for turn in moved.turns]
+        com = np.stack(
+            [
+                turn @ (centre - [0.0, 0.0, shift])
+                for turn, centre, shift in zip(turns, com, moved.shifts, strict=True)
+            ]
+        )
+        if len(inertia):
+            inertia = np.stack([rotate_inertia(*two) for two in zip(inertia, turns, strict=True)])
     return Robot(
         name=schema.name,
         mdh=mdh,
@@ -637,6 +650,11 @@ def load_robot(source: Robot | Path | str) -> Robot:
     if isinstance(source, Robot) or str(source) in builtin_robots():
         return source if isinstance(source, Robot) else load_builtin_robot(str(source))
     path = Path(source)
+    conf, _, ur_name = str(source).rpartition("#") if ".conf#" in str(source) else (path, "", "")
+    if Path(conf).suffix.lower() == ".conf":
+        from minimax_cal.robots.ur_files import read_ur_calibration  # few robots come as one
+
+        return read_ur_calibration(Path(conf), ur_name)
     from minimax_cal.robots.urdf_robot import (
         is_urdf_or_mjcf_source,
         load_urdf,
@@ -668,4 +686,9 @@ def load_robot(source: Robot | Path | str) -> Robot:
         raise RobotError(f"{path}: holds no robot; expected keys name, units, joints")
     if isinstance(content.get("robot"), Mapping):  # a saved calibration holds its robot whole
         content = content["robot"]
+    if "kinematics" in content:
+        from minimax_cal.robots.ur_files import convert_ur_kinematics, is_ur_kinematics
+
+        if is_ur_kinematics(content):
+            return convert_ur_kinematics(content, str(path))
     return robot_from_dict(content, str(path))
