@@ -17,6 +17,7 @@ from minimax_cal.cli.options import (
     ROBOT_ARGUMENT,
     ROWS_IN_ORDER_OPTION,
     CommandOutput,
+    SuggestedCommand,
     build_result_options,
     define_command,
     group_option,
@@ -136,7 +137,7 @@ def suggest_next_commands(
     data: tuple[Path, ...],
     written_path: Path | None,
     rows_in_visit_order: bool,
-) -> Iterator[tuple[str, str]]:
+) -> Iterator[SuggestedCommand]:
     """What to do next, and its command.  written_path: where the diagnosis went."""
     if written_path and diagnosis.main_findings and diagnosis.status is Status.CONVERGED:
         files = shlex.join(map(str, data))
@@ -150,12 +151,14 @@ def suggest_next_commands(
             f"{written_path} --objective sum {split}"
             "-o fit_effects.json"
         )
-        yield "Next, to calibrate with the confirmed causes", fit
+        yield SuggestedCommand("Next, to calibrate with the confirmed causes", fit)
         correct = "minimax-cal compensate fit_effects.json targets.csv -o corrected.csv"
-        yield "Then, to correct joint targets, or a program, for the controller", correct
+        yield SuggestedCommand(
+            "Then, to correct joint targets, or a program, for the controller", correct
+        )
     keep = "" if written_path else "-o diagnosis.json "
     what = "To see" if written_path else "To keep the result, and to see"
-    yield f"{what} every effect, parameter and table", f"add {keep}--details"
+    yield SuggestedCommand(f"{what} every effect, parameter and table", f"add {keep}--details")
 
 
 @define_command
