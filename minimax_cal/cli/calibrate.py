@@ -172,7 +172,7 @@ def suggest_next_commands(
         diagnose = f"minimax-cal diagnose {robot} {' '.join(map(str, data))}"
         yield SuggestedCommand(f"Next, to find the cause of the remaining {left}", diagnose)
     if written_path and fit.status is Status.CONVERGED:
-        part = " (it tells what it holds of the effects, and how well that does)"
+        part = " (prints which effects the file contains, and its accuracy)"
         alone = part if fit.cell.effects.terms else " by geometry alone"
         correct = f"minimax-cal compensate {written_path} targets.csv -o corrected.csv"
         yield SuggestedCommand(

@@ -139,7 +139,7 @@ def suggest_next_commands(
     rows_in_visit_order: bool,
 ) -> Iterator[SuggestedCommand]:
     """What to do next, and its command.  written_path: where the diagnosis went."""
-    if written_path and diagnosis.main_findings and diagnosis.status is Status.CONVERGED:
+    if diagnosis.main_findings and diagnosis.status is Status.CONVERGED:
         files = shlex.join(map(str, data))
         told, usual = diagnosis.provenance.settings, vars(DiagnosisOptions())
         given = [n for n in ("seed", "holdout", "holdout_by", "instrument") if told[n] != usual[n]]
@@ -148,10 +148,13 @@ def suggest_next_commands(
         ) + ("--rows-in-visit-order " if rows_in_visit_order else "")
         fit = (
             f"minimax-cal calibrate {robot} {files} --effects "
-            f"{written_path} --objective sum {split}"
+            f"{written_path or 'diagnosis.json'} --objective sum {split}"
             "-o fit_effects.json"
         )
-        yield SuggestedCommand("Next, to calibrate with the confirmed causes", fit)
+        if not written_path:
+            yield SuggestedCommand("Next, to keep this diagnosis", "add -o diagnosis.json")
+        first_word = "Next" if written_path else "Then"
+        yield SuggestedCommand(f"{first_word}, to calibrate with the confirmed causes", fit)
         correct = "minimax-cal compensate fit_effects.json targets.csv -o corrected.csv"
         yield SuggestedCommand(
             "Then, to correct joint targets, or a program, for the controller", correct

@@ -454,7 +454,7 @@ class CommandOutput:
         `print_result_tables`; after a failure nothing is advised but its mend, which the sentences
         hold.
         """
-        if status is Status.FAILED:
+        if status is not Status.CONVERGED:
             screen["advice"] = ()
         said = result.notices if notices is None else notices
         self.print_notices(*(text for text in said if text != reason))
