@@ -8,6 +8,7 @@ import pytest
 from conftest import ROOT, run
 
 import minimax_cal as mc
+from minimax_cal.diagnosing.diagnosis import load_diagnosis
 
 README = (ROOT / "README.md").read_text()
 
@@ -20,20 +21,24 @@ def test_the_result_is_the_one_of_the_first_command():
     assert quoted in fit.headline()
 
 
-def test_the_three_commands_print_what_is_quoted(tmp_path, monkeypatch, capsys):
+def test_the_four_commands_print_what_is_quoted(tmp_path, monkeypatch, capsys):
     mujoco = pytest.importorskip("mujoco", reason="needs pip install minimax-cal[mujoco]")
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     monkeypatch.chdir(tmp_path)
-    part = README.partition("## Three commands")[2].partition("\n## ")[0]
+    part = README.partition("## Four commands")[2].partition("\n## ")[0]
     blocks = re.findall(r"```(bash|text)\n(.*?)```", part, flags=re.S)
-    assert [kind for kind, _ in blocks].count("bash") == 3
-    out = ""
+    assert [kind for kind, _ in blocks].count("bash") == 4
+    out = err = ""
     for kind, text in blocks:
         if kind == "bash":
             assert run(*text.split()[1:]) == 0, text
-            out = capsys.readouterr().out
+            out, err = capsys.readouterr()
         else:
             assert is_quoted(text.split(), out.split()), text
+    diagnosis = load_diagnosis(tmp_path / "diagnosis.json")
+    delivered = re.search(r"mjcf holds .*?held-out RMS (\S+) mm", " ".join(err.split()))
+    assert delivered is not None  # the path ends at the last row of the diagnosis
+    assert float(delivered[1]) == pytest.approx(diagnosis.ladder[-1].holdout.rms_mm, abs=2e-3)
     assert (tmp_path / "diagnosis.png").stat().st_size > 50_000
     assert mujoco.MjModel.from_xml_path(str(tmp_path / "robot.xml")).njnt == 6
 

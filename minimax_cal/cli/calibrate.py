@@ -12,6 +12,7 @@ from minimax_cal.cli.options import (
     ROBOT_ARGUMENT,
     ROWS_IN_ORDER_OPTION,
     CommandOutput,
+    SuggestedCommand,
     build_result_options,
     define_command,
     flag_option,
@@ -157,7 +158,7 @@ def warn_of_unconfirmed_diagnoses(effects: Sequence[str]) -> Iterator[str]:
 
 def suggest_next_commands(
     fit: Fit, robot: str, data: tuple[Path, ...], written_path: Path | None
-) -> Iterator[tuple[str, str]]:
+) -> Iterator[SuggestedCommand]:
     """What to do next, and its command.  written_path: where the result went."""
     from minimax_cal.robots.urdf_robot import (
         is_urdf_or_mjcf_source,
@@ -169,12 +170,14 @@ def suggest_next_commands(
     if not has_effects and not fit.status.keeps_drawn:
         left = f"{fit.within.after.rms_mm:.3f} mm"
         diagnose = f"minimax-cal diagnose {robot} {' '.join(map(str, data))}"
-        yield f"Next, to find the cause of the remaining {left}", diagnose
+        yield SuggestedCommand(f"Next, to find the cause of the remaining {left}", diagnose)
     if written_path and fit.status is Status.CONVERGED:
-        part = " (it tells what it holds of the effects, and how well that does)"
+        part = " (prints which effects the file contains, and its accuracy)"
         alone = part if fit.cell.effects.terms else " by geometry alone"
         correct = f"minimax-cal compensate {written_path} targets.csv -o corrected.csv"
-        yield f"To correct joint targets, or a program, for the controller{alone}", correct
+        yield SuggestedCommand(
+            f"To correct joint targets, or a program, for the controller{alone}", correct
+        )
         write, file = "To write a file for MuJoCo, or --to urdf, dh-csv and others", "--to mjcf"
         out = "arm.xml"
         if is_urdf_or_mjcf_source(robot):
@@ -182,7 +185,11 @@ def suggest_next_commands(
             kind = "urdf" if is_urdf_source(robot) else "mjcf"
             write, out = f"To correct a copy of {name}", f"calibrated{Path(name).suffix}"
             file = f"--to {kind} --{kind} {name}" + f" --tip {tip}" * bool(tip)
-        yield f"{write}{alone}", f"minimax-cal export {written_path} {file} -o {out}"
-        yield "To see every parameter and table", "add --details"
+        yield SuggestedCommand(
+            f"{write}{alone}", f"minimax-cal export {written_path} {file} -o {out}"
+        )
+        yield SuggestedCommand("To see every parameter and table", "add --details")
     else:
-        yield "To keep the result, and to see every table", "add -o fit.json --details"
+        yield SuggestedCommand(
+            "To keep the result, and to see every table", "add -o fit.json --details"
+        )

@@ -17,6 +17,7 @@ from minimax_cal.cli.options import (
     ROBOT_ARGUMENT,
     ROWS_IN_ORDER_OPTION,
     CommandOutput,
+    SuggestedCommand,
     build_result_options,
     define_command,
     group_option,
@@ -136,9 +137,9 @@ def suggest_next_commands(
     data: tuple[Path, ...],
     written_path: Path | None,
     rows_in_visit_order: bool,
-) -> Iterator[tuple[str, str]]:
+) -> Iterator[SuggestedCommand]:
     """What to do next, and its command.  written_path: where the diagnosis went."""
-    if written_path and diagnosis.main_findings and diagnosis.status is Status.CONVERGED:
+    if diagnosis.main_findings and diagnosis.status is Status.CONVERGED:
         files = shlex.join(map(str, data))
         told, usual = diagnosis.provenance.settings, vars(DiagnosisOptions())
         given = [n for n in ("seed", "holdout", "holdout_by", "instrument") if told[n] != usual[n]]
@@ -147,15 +148,20 @@ def suggest_next_commands(
         ) + ("--rows-in-visit-order " if rows_in_visit_order else "")
         fit = (
             f"minimax-cal calibrate {robot} {files} --effects "
-            f"{written_path} --objective sum {split}"
+            f"{written_path or 'diagnosis.json'} --objective sum {split}"
             "-o fit_effects.json"
         )
-        yield "Next, to calibrate with the confirmed causes", fit
+        if not written_path:
+            yield SuggestedCommand("Next, to keep this diagnosis", "add -o diagnosis.json")
+        first_word = "Next" if written_path else "Then"
+        yield SuggestedCommand(f"{first_word}, to calibrate with the confirmed causes", fit)
         correct = "minimax-cal compensate fit_effects.json targets.csv -o corrected.csv"
-        yield "Then, to correct joint targets, or a program, for the controller", correct
+        yield SuggestedCommand(
+            "Then, to correct joint targets, or a program, for the controller", correct
+        )
     keep = "" if written_path else "-o diagnosis.json "
     what = "To see" if written_path else "To keep the result, and to see"
-    yield f"{what} every effect, parameter and table", f"add {keep}--details"
+    yield SuggestedCommand(f"{what} every effect, parameter and table", f"add {keep}--details")
 
 
 @define_command

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from inspect import signature
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import click
 
@@ -35,7 +35,14 @@ LOG_OPTION_GROUP = "Logs of motion"
 LOG_ONLY_OPTION_NAMES = {*signature(motion_gap).parameters} - {*signature(simulator_gap).parameters}
 
 
-def parse_gain_pairs(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
+class GainPairs(NamedTuple):
+    """Gains of the drives, one each of every joint or one for all [N m/rad, N m s/rad]."""
+
+    position: tuple[float, ...]
+    velocity: tuple[float, ...]
+
+
+def parse_gain_pairs(text: str) -> GainPairs:
     """KP:KD of each joint, separated by commas, or one for all.  Raises OptionError."""
     pairs = [part.partition(":") for part in text.split(",")]
     both = tuple(tuple(parse_number_or_nan(pair[k]) for pair in pairs) for k in (0, 2))
@@ -43,7 +50,7 @@ def parse_gain_pairs(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
         raise OptionError(
             f"gains={text!r}: give KP:KD of each joint in N m/rad and N m s/rad, as 2000:200"
         )
-    return both[0], both[1]
+    return GainPairs(*both)
 
 
 @define_command

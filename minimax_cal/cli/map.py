@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import click
 
@@ -32,21 +32,27 @@ from minimax_cal.validation.workspace_maps import (
 )
 
 
-def build_predictors(
-    saved: SavedResult, frame: str, source: str
-) -> tuple[Predict, Predict, tuple[str, ...]]:
+class PositionPredictors(NamedTuple):
+    """Predicted 95 % radii of the centroid and of a measurement of it; notices where unknown."""
+
+    of_centroid: Predict
+    of_measurement: Predict
+    notices: tuple[str, ...]
+
+
+def build_predictors(saved: SavedResult, frame: str, source: str) -> PositionPredictors:
     """What the covariance of a saved fit predicts of the centroid, and of a measurement of it.
 
     With a notice where it holds none.
     """
     known, cell = saved.uncertainty, saved.cells[AFTER]
     if known is None:
-        return (
+        return PositionPredictors(
             predict_nan_radius,
             predict_nan_radius,
             (f"{source}: holds no covariance, so nothing is predicted",),
         )
-    return (
+    return PositionPredictors(
         build_radius_predictor(cell, known, frame),
         build_radius_predictor(cell, known, measured=True),
         (),

@@ -11,7 +11,7 @@ from importlib.util import find_spec
 from inspect import Parameter, signature
 from math import inf, isnan
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
 
 import click
 from click.core import ParameterSource
@@ -69,7 +69,6 @@ MOST_USED_OPTIONS = {  # ten of each command with many options, by their names i
     "gap": "write fit diagnosis tip payload drive_gain ratio figure details output",
 }
 PICTURE_ENDINGS = (".png", ".svg", ".pdf")
-NextCommands = Iterable[tuple[str, str]]  # what for, and the command
 LazyContent = Callable[[], Any] | None  # what is made where it is asked for
 CallResult = TypeVar("CallResult")
 CommandFunction = Callable[..., Any]
@@ -88,6 +87,29 @@ ROWS_IN_ORDER_OPTION = flag_option(
     "in_rows",
     help="Take the rows as the poses were visited, where the file tells no order.",
 )
+
+
+class SuggestedCommand(NamedTuple):
+    """A command to go on with.  purpose: what it is for, a phrase."""
+
+    purpose: str
+    command: str
+
+
+class OptionForm(NamedTuple):
+    """How click reads an option.  to_si: from what is typed to SI."""
+
+    click_type: Any
+    shown_default: Any
+    metavar: str
+    to_si: Callable[[Any], Any]
+
+
+class CameraAndOtherFiles(NamedTuple):
+    """Files of cameras, and tables of the other data files."""
+
+    camera_files: PixelFiles
+    other_tables: list[MeasurementTable]
 
 
 class RenamedOption(click.Option):
@@ -125,7 +147,7 @@ SAFE_CELLS_OPTION = flag_option(
 def options_from_dataclass(
     dataclass_type: Any, *field_names: str, **option_changes: Any
 ) -> CommandDecorator:
-    """Options of a command from the fields of a dataclass that are made by `ground.options.option`.
+    """Options of a command from the fields of a dataclass that are made by `option_field`.
 
     The command gets their values as keywords of the fields' names, in SI.  field_names: which
     fields. option_changes: what is not as there, as their group.
@@ -144,15 +166,10 @@ def options_from_dataclass(
 def take_option_record(
     dataclass_type: Callable[..., CallResult], option_values: dict[str, Any]
 ) -> CallResult:
-    """A record of options, from what a command got; they are taken from there."""
-    told: Any = dataclass_type
-    return dataclass_type(
-        **{
-            one.name: option_values.pop(one.name)
-            for one in fields(told)
-            if one.name in option_values
-        }
-    )
+    """A record of options; its values are removed from the option values of the command."""
+    record_fields = fields(cast(Any, dataclass_type))
+    names = [field.name for field in record_fields if field.name in option_values]
+    return dataclass_type(**{name: option_values.pop(name) for name in names})
 
 
 def options_given_on_command_line() -> set[str]:
@@ -265,16 +282,14 @@ class CommandWithGroupedHelp(click.Command):
             formatter.write(f"\nEvery option: {ctx.command_path} {HELP_ALL_FLAG}\n")
 
 
-def option_type_and_conversion(
-    default: Any, option: Option, name: str
-) -> tuple[Any, Any, str, Callable[[Any], Any]]:
-    """Type of what people give, its default and metavar, and what it is in SI."""
+def option_type_and_conversion(default: Any, option: Option, name: str) -> OptionForm:
+    """How click reads an option, from its default, unit and reader."""
     scale = SI_PER_OPTION_UNIT[option.unit]
     if option.read is Path:
-        return PATH_TYPE, None, "", Path
+        return OptionForm(PATH_TYPE, None, "", Path)
     if isinstance(default, tuple) and default:
         low, high = (f"{end / scale:g}" for end in default)
-        return (
+        return OptionForm(
             str,
             f"{low}:{high}",
             "LOW:HIGH",
@@ -282,10 +297,10 @@ def option_type_and_conversion(
         )
     if option.unit or isinstance(default, float):
         shown = None if default is None or isnan(default) else round(default / scale, 9)
-        return float, shown, option.unit.upper(), lambda value: value * scale
+        return OptionForm(float, shown, option.unit.upper(), lambda value: value * scale)
     if isinstance(default, bool | int | str) and default != "":
-        return type(default), default, "", option.read or type(default)
-    return str, None, "", option.read or (tuple if option.values > 1 else str)
+        return OptionForm(type(default), default, "", option.read or type(default))
+    return OptionForm(str, None, "", option.read or (tuple if option.values > 1 else str))
 
 
 def define_command(function: CommandFunction) -> click.Command:
@@ -381,7 +396,7 @@ class CommandOutput:
             )
 
     def remember_file_kinds(self, *sources: tuple[str, str]) -> None:
-        """Say on stderr what files were taken for, once the work comes to something."""
+        """Store what each file holds, so that stderr says it before the first other line."""
         if not self.quiet:
             UNREPORTED_FILE_KINDS.set([f"{source} holds {what}" for source, what in sources])
 
@@ -447,7 +462,7 @@ class CommandOutput:
         `print_result_tables`; after a failure nothing is advised but its mend, which the sentences
         hold.
         """
-        if status is Status.FAILED:
+        if status is not Status.CONVERGED:
             screen["advice"] = ()
         said = result.notices if notices is None else notices
         self.print_notices(*(text for text in said if text != reason))
@@ -465,7 +480,7 @@ class CommandOutput:
         sentences: Sequence[str] = (),
         more: Sequence[Table] = (),
         tables: LazyContent = None,
-        advice: NextCommands | None = None,
+        advice: Iterable[SuggestedCommand] | None = None,
     ) -> None:
         """Print the first screen of a result, or with --details its sentences and every table.
 
@@ -501,11 +516,15 @@ class CommandOutput:
                 Text(replace_invisible_and_bidi_characters(f"  {line}")), soft_wrap=True
             )  # to be copied in one piece
 
-    def suggest_keeping_result(self) -> NextCommands:
-        """How to see every table, and to keep a result that was not written."""
+    def suggest_keeping_result(self) -> list[SuggestedCommand]:
+        """Suggest how to keep a result that was not written, and how to see every table."""
         if self.output:
-            return [("To see every table", "add --details")]
-        return [("To keep the result, and to see every table", f"add -o {self.keep} --details")]
+            return [SuggestedCommand("To see every table", "add --details")]
+        return [
+            SuggestedCommand(
+                "To keep the result, and to see every table", f"add -o {self.keep} --details"
+            )
+        ]
 
 
 def pass_output_to_command(
@@ -579,8 +598,8 @@ def read_any_measurements(
 
 def split_camera_files(
     data_paths: Sequence[Path], option_values: dict[str, Any]
-) -> tuple[PixelFiles, list[MeasurementTable]]:
-    """What is given of cameras, by options or among the files of data, and the other files.
+) -> CameraAndOtherFiles:
+    """Split camera files, given by options or among the data files, from the other data files.
 
     option_values: options of a command, which `PixelFiles` are taken from.  Raises OptionError.
     """
@@ -596,7 +615,9 @@ def split_camera_files(
         refuse_given_options(
             CAMERA_OPTION_NAMES, "is about what cameras see, with pixels=, joints= and camera="
         )
-    return files.find_in_data([read_measurement_table(path) for path in data_paths])
+    return CameraAndOtherFiles(
+        *files.find_in_data([read_measurement_table(path) for path in data_paths])
+    )
 
 
 def run_on_any_instruments(

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import copy_context
-from typing import Any
+from typing import Any, NamedTuple
 
 from rich.console import Console
 from rich.live import Live
@@ -22,6 +22,13 @@ SECONDS_TO_FIRST_PROGRESS_LINE, SECONDS_BETWEEN_PROGRESS_LINES = (
 )  # seconds to the first line, and between lines, without a terminal
 
 
+class StageTimes(NamedTuple):
+    """Seconds since the work began, and seconds left; None of stages that are not counted."""
+
+    elapsed: float
+    remaining: float | None
+
+
 class StageClock:
     """What the work is at, since when, and how long it will take where its steps are counted."""
 
@@ -30,15 +37,15 @@ class StageClock:
         self.began = self.counting = now()
         self.kind = ""
 
-    def elapsed_and_remaining_seconds(self, stage: ProgressStage) -> tuple[float, float | None]:
+    def elapsed_and_remaining_seconds(self, stage: ProgressStage) -> StageTimes:
         """Seconds so far, and seconds left of stages that count, None of others."""
         now = self.now()
         if stage.kind != self.kind:
             self.kind, self.counting = stage.kind, now
         done = stage.part - 1  # the part named has just begun
         if done < 1 or now <= self.counting:
-            return now - self.began, None
-        return now - self.began, (now - self.counting) / done * (stage.parts - done)
+            return StageTimes(now - self.began, None)
+        return StageTimes(now - self.began, (now - self.counting) / done * (stage.parts - done))
 
     def format_stage(self, stage_text: str) -> str:
         """A stage with the time so far, and the time left of those that count."""

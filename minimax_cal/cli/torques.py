@@ -11,6 +11,7 @@ import click
 from minimax_cal.cli.options import (
     PATH_TYPE,
     CommandOutput,
+    SuggestedCommand,
     build_result_options,
     define_command,
     options_from_dataclass,
@@ -101,10 +102,10 @@ def torques_command(
 
 def suggest_next_commands(
     model: str, logs: tuple[Path, ...], written_model: Path | None, output: CommandOutput
-) -> Iterator[tuple[str, str]]:
+) -> Iterator[SuggestedCommand]:
     """What to do next, and its command.  written_model: the MJCF."""
     if Path(model).suffix.lower() in MJCF_SUFFIXES and not written_model:
         files = " ".join(map(str, logs))
         fix = f"minimax-cal torques {model} {files} --write corrected.xml"
-        yield "Next, to write a model with these masses and friction", fix
+        yield SuggestedCommand("Next, to write a model with these masses and friction", fix)
     yield from output.suggest_keeping_result()

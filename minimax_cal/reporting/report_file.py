@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from datetime import date as Date
 from pathlib import Path
+from typing import NamedTuple
 
 from minimax_cal.core.errors import OptionError
 from minimax_cal.core.files import check_output_path, write_file_atomically
@@ -40,6 +41,14 @@ requirement_option, report_text_option = (
     option_field_in_group("What the page says"),
 )
 HTML_SUFFIXES, PDF_SUFFIXES, PNG_SUFFIXES = (".html", ".htm"), (".pdf",), (".png",)
+
+
+class JudgedReport(NamedTuple):
+    """A report, what it judges, and notices for the reader."""
+
+    document: ReportDocument
+    judgement: ReportJudgement | MotionReportSource
+    notices: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -177,13 +186,13 @@ def write_report(
 
 def build_document_and_judgement(
     results: Sequence[ReportableResult], request: ReportRequest
-) -> tuple[ReportDocument, ReportJudgement | MotionReportSource, tuple[str, ...]]:
+) -> JudgedReport:
     """The page, what it judges, and what the reader should know of the results."""
     if motion := find_motion_diagnosis(results):
-        return build_motion_report(motion, request), motion, ()
+        return JudgedReport(build_motion_report(motion, request), motion, ())
     sources = read_report_sources(results)
     found = request.judge_sources(sources)
-    return build_report(sources, request, found), found, sources.notices
+    return JudgedReport(build_report(sources, request, found), found, sources.notices)
 
 
 def resolve_report_date(date_text: str) -> str:

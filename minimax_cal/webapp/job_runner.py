@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Annotated, Any, NamedTuple, cast
 
 from minimax_cal.core.display_text import clean_and_shorten_to_one_line
 from minimax_cal.core.errors import CalibrationError, OptionError
@@ -126,6 +126,13 @@ class StepJob:
                 "done": done, "rungs": self.rungs}  # fmt: skip
 
 
+class CommandOutcome(NamedTuple):
+    """How a command line ended."""
+
+    exit_code: int
+    stdout_text: str
+
+
 class JobRunner:
     """The processes of all sessions, one at a time in each, as many at once as there are cores."""
 
@@ -168,7 +175,7 @@ class JobRunner:
         finally:
             self.jobs.pop(job.session.name, None)
 
-    async def run_command_line(self, job: StepJob, command: CommandLine) -> tuple[int, str]:
+    async def run_command_line(self, job: StepJob, command: CommandLine) -> CommandOutcome:
         """Run a command line; its exit code and what it printed."""
         pipe = asyncio.subprocess.PIPE
         job.process = process = await asyncio.create_subprocess_exec(
@@ -192,7 +199,7 @@ class JobRunner:
             code, job.error = 0, ""
         if code and not job.error:
             job.error = "; ".join(list(job.other)[-3:]) or f"the command ended with {code}"
-        return code, text[:MAX_KEPT_OUTPUT_LETTERS]
+        return CommandOutcome(code, text[:MAX_KEPT_OUTPUT_LETTERS])
 
     async def cancel_job(self, session_name: str) -> None:
         """End the work of a session; files are whole or as they were."""

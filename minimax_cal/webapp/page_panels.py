@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 from numpy import nan_to_num
 
@@ -28,6 +28,7 @@ from minimax_cal.webapp.point_errors import MeasuredPoint, list_points_with_erro
 from minimax_cal.webapp.sessions import (
     SCRIPT_FILE,
     UPLOAD_FOLDER,
+    FileVersion,
     Session,
     SessionChoices,
     file_version,
@@ -70,7 +71,45 @@ WRITTEN_FILE_DESCRIPTIONS = {
     CORRECTED_TARGETS_FILE: "the joint targets, corrected",
 }
 PanelContent = dict[str, Any]
-NumberTile = tuple[str, str, str]  # name, before, after
+
+
+class NumberTile(NamedTuple):
+    """A number in large letters, before and after the calibration."""
+
+    name: str
+    before: str
+    after: str
+
+
+class RobotChoice(NamedTuple):
+    """A robot to choose."""
+
+    value: str
+    label: str
+
+
+class ImportedFileSummary(NamedTuple):
+    """A measured file: format and rows in a sentence, and its columns."""
+
+    sentence: str
+    column_table: Table
+
+
+class FitSummary(NamedTuple):
+    """What the page shows of a calibration."""
+
+    headline: str
+    tiles: list[NumberTile]
+    accuracy_table: Table
+    solution: str
+
+
+class DiagnosisSummary(NamedTuple):
+    """What the page shows of a diagnosis.  chart: the error budget, for plotly."""
+
+    sentences: tuple[str, ...]
+    tables: tuple[Table, ...]
+    chart: PanelContent
 
 
 def build_page_state(session: Session, progress: StepProgress | None) -> dict[str, Any]:
@@ -88,17 +127,19 @@ def build_page_state(session: Session, progress: StepProgress | None) -> dict[st
     }
 
 
-def list_robot_choices(session: Session, choices: SessionChoices) -> list[tuple[str, str]]:
+def list_robot_choices(session: Session, choices: SessionChoices) -> list[RobotChoice]:
     """Value and label of every robot to choose: those built in, and files that were dropped."""
     known = choices.named_files() - {choices.robot}
-    dropped = [(name, name) for name in session.list_uploaded_files() if name not in known]
+    dropped = [
+        RobotChoice(name, name) for name in session.list_uploaded_files() if name not in known
+    ]
     return [*dropped, *list_builtin_robots()]
 
 
 @lru_cache(maxsize=1)
-def list_builtin_robots() -> tuple[tuple[str, str], ...]:
+def list_builtin_robots() -> tuple[RobotChoice, ...]:
     """Value and label of the built-in robots."""
-    return tuple((name, load_robot(name).name) for name in builtin_robots())
+    return tuple(RobotChoice(name, load_robot(name).name) for name in builtin_robots())
 
 
 def describe_step_state(
@@ -197,7 +238,7 @@ def build_import_panel(
     }
 
 
-def describe_imported_file(file_record: dict[str, Any]) -> tuple[str, Table]:
+def describe_imported_file(file_record: dict[str, Any]) -> ImportedFileSummary:
     """A file in a line, and its columns."""
     line = (
         f"{file_record['file']}: {file_record['format']}, "
@@ -210,8 +251,9 @@ def describe_imported_file(file_record: dict[str, Any]) -> tuple[str, Table]:
         tuple(replace_invisible_and_bidi_characters(str(v)) for v in column.values())
         for column in columns
     )
-    return replace_invisible_and_bidi_characters(line), Table(
-        str(file_record["file"]), header, rows
+    return ImportedFileSummary(
+        replace_invisible_and_bidi_characters(line),
+        Table(str(file_record["file"]), header, rows),
     )
 
 
@@ -223,7 +265,7 @@ def build_robot_panel(
         return None
     built_in = choices.robot in builtin_robots()
     file = (
-        (choices.robot, 0, 0)
+        FileVersion(choices.robot, 0, 0)
         if built_in
         else file_version(session.folder / UPLOAD_FOLDER / choices.robot)
     )
@@ -236,15 +278,15 @@ def read_links_table(robot_path: str, modified_ns: int, byte_count: int) -> Tabl
     return build_links_table(load_robot(robot_path))
 
 
-def build_fit_panel(
+def build_fit_result_panel(
     session: Session, choices: SessionChoices, progress: StepProgress | None
 ) -> PanelContent | None:
     """The calibration in a sentence, and its numbers in large letters."""
     path = session.folder / FIT_FILE
     if not path.is_file():
         return None
-    headline, tiles, _, solution = read_fit_summary(*file_version(path))
-    return {"headline": headline, "tiles": tiles, "solution": solution}
+    found = read_fit_summary(*file_version(path))
+    return {"headline": found.headline, "tiles": found.tiles, "solution": found.solution}
 
 
 def build_accuracy_panel(
@@ -252,23 +294,23 @@ def build_accuracy_panel(
 ) -> PanelContent | None:
     """The calibration's table of accuracy."""
     path = session.folder / FIT_FILE
-    return {"table": read_fit_summary(*file_version(path))[2]} if path.is_file() else None
+    return (
+        {"table": read_fit_summary(*file_version(path)).accuracy_table} if path.is_file() else None
+    )
 
 
 @lru_cache(maxsize=MAX_CACHED_RESULTS)
-def read_fit_summary(
-    fit_path: str, modified_ns: int, byte_count: int
-) -> tuple[str, list[NumberTile], Table, str]:
+def read_fit_summary(fit_path: str, modified_ns: int, byte_count: int) -> FitSummary:
     """Headline, numbers, accuracy and facts of a calibration's file as it was at a moment."""
     fit = Fit.load(fit_path)
     seen = fit.within
     known = sum(parameter.identifiable for parameter in fit.parameters)
     tiles = [
-        ("RMS", f"{seen.before.rms_mm:.3f}", f"{seen.after.rms_mm:.3f} mm"),
-        ("largest", f"{seen.before.max_mm:.3f}", f"{seen.after.max_mm:.3f} mm"),
-        ("parameters known", "", f"{known} of {len(fit.parameters)}"),
+        NumberTile("RMS", f"{seen.before.rms_mm:.3f}", f"{seen.after.rms_mm:.3f} mm"),
+        NumberTile("largest", f"{seen.before.max_mm:.3f}", f"{seen.after.max_mm:.3f} mm"),
+        NumberTile("parameters known", "", f"{known} of {len(fit.parameters)}"),
     ]
-    return fit.headline(), tiles, fit.accuracy_table(), fit.describe_solution()
+    return FitSummary(fit.headline(), tiles, fit.accuracy_table(), fit.describe_solution())
 
 
 def build_points_panel(
@@ -306,11 +348,13 @@ def build_diagnosis_panel(
 @lru_cache(maxsize=MAX_CACHED_RESULTS)
 def read_diagnosis_summary(
     diagnosis_path: str, modified_ns: int, byte_count: int
-) -> tuple[tuple[str, ...], tuple[Table, ...], PanelContent]:
+) -> DiagnosisSummary:
     """Sentences, tables and chart of a diagnosis' file as it was at a moment."""
     gap = load_diagnosis(diagnosis_path)
     tables = drop_empty_tables(gap.budget_table(), gap.effects_table(), gap.alternative_table())
-    return gap.said, tables, chart_to_json_data(build_budget_chart_of_diagnosis(gap))
+    return DiagnosisSummary(
+        gap.said, tables, chart_to_json_data(build_budget_chart_of_diagnosis(gap))
+    )
 
 
 def build_verdict_panel(
@@ -402,7 +446,7 @@ PANEL_BUILDERS: dict[
     "files": build_files_panel,
     "understood": build_import_panel,
     "robot": build_robot_panel,
-    "fit": build_fit_panel,
+    "fit": build_fit_result_panel,
     "accuracy": build_accuracy_panel,
     "points": build_points_panel,
     "ladder": build_diagnosis_panel,

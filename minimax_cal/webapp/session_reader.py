@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 from minimax_cal.compensation.target_file import read_target_file
 from minimax_cal.core.errors import CalibrationError, CalibrationWarning
@@ -39,7 +39,7 @@ def read_chart(session: Session, name: str) -> dict[str, Any]:
     """A chart: traces and layout as plotly draws them."""
     if name == "workspace":
         return build_workspace_view_data(*file_version(session.folder / FIT_FILE))
-    return read_diagnosis_summary(*file_version(session.folder / DIAGNOSIS_FILE))[2]
+    return read_diagnosis_summary(*file_version(session.folder / DIAGNOSIS_FILE)).chart
 
 
 def read_file_content_kinds(session: Session, names: Sequence[str]) -> dict[str, list[str]]:
@@ -61,6 +61,13 @@ def build_step_commands(session: Session, step: str) -> list[dict[str, Any]]:
     ]
 
 
+class HttpAnswer(NamedTuple):
+    """Status of HTTP, and JSON for the browser."""
+
+    status: int
+    json_bytes: bytes
+
+
 QUESTION_HANDLERS: dict[str, Callable[..., Any]] = {
     "state": read_state,
     "view": read_chart,
@@ -70,7 +77,7 @@ QUESTION_HANDLERS: dict[str, Callable[..., Any]] = {
 }
 
 
-def answer_question(question_line: bytes) -> tuple[int, bytes]:
+def answer_question(question_line: bytes) -> HttpAnswer:
     """Status of HTTP, and the JSON of an answer or of what is wrong."""
     question = parse_json(question_line)
     verb, folder = question.pop("verb"), Path(question.pop("folder"))
@@ -83,7 +90,7 @@ def answer_question(question_line: bytes) -> tuple[int, bytes]:
     except Exception:
         traceback.print_exc()
         found, status = {"error": "this session could not be read; the terminal says why"}, 500
-    return status, json.dumps(found, ensure_ascii=False, allow_nan=False).encode()
+    return HttpAnswer(status, json.dumps(found, ensure_ascii=False, allow_nan=False).encode())
 
 
 def queue_stdin_questions_then_exit(queue: SimpleQueue[bytes]) -> None:

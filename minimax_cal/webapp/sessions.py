@@ -12,7 +12,7 @@ from functools import lru_cache
 from hashlib import file_digest
 from itertools import chain, count
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -234,21 +234,29 @@ class Session:
         where = self.folder / path
         return sha256_of_file_version(*file_version(where)) if where.is_file() else ""
 
-    def list_file_versions(self) -> tuple[tuple[str, int, int], ...]:
-        """Changes whenever a file of the session does."""
+    def list_file_versions(self) -> tuple[FileVersion, ...]:
+        """Versions of all files of the session, sorted; they differ once a file has changed."""
         every = (self.folder, self.folder / UPLOAD_FOLDER, self.folder / LOG_FOLDER)
         there = [folder for folder in every if folder.is_dir()]
         found = [path for folder in there for path in folder.iterdir() if is_complete_file(path)]
         return tuple(sorted(map(file_version, found)))
 
 
-def file_version(path: Path) -> tuple[str, int, int]:
-    """What changes when a file does: name, moment and length."""
+def file_version(path: Path) -> FileVersion:
+    """Path, time of modification and length of a file; zeros of a file that is gone."""
     try:
         stat = path.stat()
     except OSError:  # just removed
-        return str(path), 0, 0
-    return str(path), stat.st_mtime_ns, stat.st_size
+        return FileVersion(str(path), 0, 0)
+    return FileVersion(str(path), stat.st_mtime_ns, stat.st_size)
+
+
+class FileVersion(NamedTuple):
+    """A file as it was at a moment."""
+
+    path: str
+    modified_ns: int
+    byte_count: int
 
 
 @lru_cache(maxsize=256)

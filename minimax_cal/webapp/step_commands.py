@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 from minimax_cal.core.errors import OptionError
 from minimax_cal.core.files import parse_json
@@ -53,6 +54,14 @@ class SessionStep:
     build_commands: Callable[[Session, SessionChoices], tuple[CommandLine, ...]]
 
 
+class StepFitInputs(NamedTuple):
+    """Inputs of a fit.  import_commands: write the data file without points left out."""
+
+    import_commands: tuple[CommandLine, ...]
+    robot: str
+    data_file: str
+
+
 def build_import_commands(session: Session, choices: SessionChoices) -> tuple[CommandLine, ...]:
     """The files of tracker and controller, as measurements."""
     if not choices.measured:
@@ -71,10 +80,8 @@ def build_import_commands(session: Session, choices: SessionChoices) -> tuple[Co
     )
 
 
-def prepare_fit_inputs(
-    session: Session, choices: SessionChoices
-) -> tuple[tuple[CommandLine, ...], str, str]:
-    """What makes the data of a fit, the robot and the data."""
+def prepare_fit_inputs(session: Session, choices: SessionChoices) -> StepFitInputs:
+    """Robot and data file of a fit.  Raises OptionError where one is missing."""
     if not (session.folder / POSES_FILE).is_file():
         raise OptionError("the measurements have not been read yet")
     if not choices.robot:
@@ -83,7 +90,7 @@ def prepare_fit_inputs(
         choices.robot if choices.robot in builtin_robots() else f"{UPLOAD_FOLDER}/{choices.robot}"
     )
     if not choices.left_out:
-        return (), robot, POSES_FILE
+        return StepFitInputs((), robot, POSES_FILE)
     by_reason: dict[str, list[str]] = {}
     for point in choices.left_out:
         by_reason.setdefault(choices.reasons.get(point, "").strip(), []).append(point)
@@ -91,7 +98,7 @@ def prepare_fit_inputs(
         f"--leave-out={','.join(points)}" + (f"={why}" if why else "")
         for why, points in by_reason.items()
     ]
-    return (
+    return StepFitInputs(
         (CommandLine(("import", POSES_FILE, *left, "-o", USED_POINTS_FILE)),),
         robot,
         USED_POINTS_FILE,

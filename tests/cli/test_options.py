@@ -3,6 +3,8 @@
 import json
 from collections.abc import Iterator
 from importlib import resources
+from pathlib import Path
+from types import SimpleNamespace as Namespace
 from typing import Any
 
 import click
@@ -11,15 +13,23 @@ import pytest
 from click.testing import CliRunner
 
 import minimax_cal as mc
-from minimax_cal.cli.options import options_from_dataclass, options_from_parameters
+from minimax_cal.cli.diagnose import suggest_next_commands
+from minimax_cal.cli.options import (
+    CommandOutput,
+    SuggestedCommand,
+    options_from_dataclass,
+    options_from_parameters,
+)
 from minimax_cal.cli.schemas import SCHEMA_CLASS_BY_KIND, build_file_schema
 from minimax_cal.compensation.joint_compensation import compensate
 from minimax_cal.core.option_fields import Option
+from minimax_cal.diagnosing.diagnose import DiagnosisOptions
 from minimax_cal.fitting.multi_instrument.options import RelativeOptions
 from minimax_cal.fitting.options import Options
 from minimax_cal.modelling.simulate import Truth
 from minimax_cal.planning.plan_options import PlanOptions
 from minimax_cal.robots.robot import robot_from_dict
+from minimax_cal.solvers.status import Status
 from minimax_cal.validation.workspace_maps import MapGrid
 
 # ---- options -------------------------------------------------------------------------------------
@@ -154,3 +164,38 @@ def test_notes_are_free_and_nothing_else():
     joint = [WHOLE["joints"][0] | {"note": "worn"}]
     with pytest.raises(mc.CalibrationError, match=r"joints\[0\]: unknown key 'note'"):
         robot_from_dict(WHOLE | {"joints": joint})
+
+
+@pytest.mark.parametrize("status", [one for one in Status if one is not Status.CONVERGED])
+def test_after_a_failure_nothing_is_suggested_but_its_mend(status, capsys):
+    class Result:
+        notices = ()
+        json = headline = lambda self: "result"
+        first_tables = tables = lambda self: ()
+
+    advice = [SuggestedCommand("Next, to go on", "minimax-cal go")]
+    output = CommandOutput(keep="fit.json")
+    assert output.write_and_print_result(Result(), status=status, advice=advice) == 1
+    out, err = capsys.readouterr()
+    assert "Next" not in out
+    assert "minimax-cal go" not in out
+    assert status.advice[:40] in err
+    assert output.write_and_print_result(Result(), advice=advice) == 0
+    assert "minimax-cal go" in capsys.readouterr().out
+
+
+def test_a_diagnosis_that_was_not_written_suggests_the_same_calibration():
+    fit = Namespace(seed=0)
+    usual = vars(DiagnosisOptions())
+    names = ("seed", "holdout", "holdout_by", "instrument")
+    settings = {name: usual.get(name) for name in names}
+    diagnosis = Namespace(main_findings=(fit,), status=Status.CONVERGED,
+                          provenance=Namespace(settings=settings))  # fmt: skip
+    lists = [
+        list(suggest_next_commands(diagnosis, "arm.json", (Path("a b.csv"),), path, False))
+        for path in (None, Path("diagnosis.json"))
+    ]
+    fits = [one.command for each in lists for one in each if " calibrate " in one.command]
+    assert fits[0] == fits[1]
+    assert "--effects diagnosis.json" in fits[0]
+    assert lists[0][0].command == "add -o diagnosis.json"

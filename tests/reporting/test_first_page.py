@@ -363,7 +363,7 @@ def test_with_room_enough_it_is_passed_with_them_too(files):
     found = judge_sources(
         read_report_sources([files / "used.json"]), parse_tolerance_limits("rms 2"), "inside", None
     )
-    assert (found.verdict_sentence, found.verdict) == (
+    assert (found.requirement_verdict_sentence, found.verdict) == (
         f"{PASSED} inside the measured region",
         PASSED,
     )
@@ -377,7 +377,7 @@ def test_a_diagnosis_alone_says_it_as_well(files):
         read_report_sources([files / "gap.json"]), parse_tolerance_limits("rms 0.1"), "inside", None
     )
     assert found.verdict == PASSED
-    assert found.verdict_sentence.startswith(
+    assert found.requirement_verdict_sentence.startswith(
         f"{PASSED} without {2 * BAD} points set aside by the user"
     )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from difflib import get_close_matches
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,6 +29,13 @@ REPORT_TEXT_KEYS = ("title", "customer", "author", "date")  # these may stand th
 MEASURED_FACT_COLUMNS = {"payload": ("payload", "kg"), "temperature": ("temperature", "°C")}
 
 
+class LabelledFact(NamedTuple):
+    """A fact of the title block.  text: empty where people fill it in by hand."""
+
+    label: str
+    text: str
+
+
 def read_facts_file(path: Path | str) -> dict[str, str]:
     """The facts of a TOML file by their keys.  Raises OptionError."""
     content = read_toml(path)
@@ -48,7 +56,7 @@ def read_facts_file(path: Path | str) -> dict[str, str]:
 
 def list_labelled_facts(
     facts: Mapping[str, str], measurements: Measurements | None
-) -> tuple[tuple[str, str], ...]:
+) -> tuple[LabelledFact, ...]:
     """Label and text of every fact; measured ones from their columns; empty to be filled in."""
     measured = (
         {
@@ -59,7 +67,8 @@ def list_labelled_facts(
         else {}
     )
     return tuple(
-        (label, facts.get(key) or measured.get(key, "")) for key, label in FACT_LABELS.items()
+        LabelledFact(label, facts.get(key) or measured.get(key, ""))
+        for key, label in FACT_LABELS.items()
     )
 
 

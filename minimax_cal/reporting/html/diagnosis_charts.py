@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -36,11 +36,25 @@ MAX_CORRELATION_MAP_LABELS = 24  # of a side of the map of correlations
 MAX_AXIS_STRETCH = 2.0  # an axis that a few points stretch more than this is cut
 
 
-def identified_correlations(uncertainty: Uncertainty) -> tuple[tuple[str, ...], Array]:
+class ParameterCorrelations(NamedTuple):
+    """Correlations (p, p) of named parameters."""
+
+    names: tuple[str, ...]
+    matrix: Array
+
+
+class TrimmedAxis(NamedTuple):
+    """Limits of an axis, empty where all points fit; how many points lie outside."""
+
+    limits: list[float]
+    sentence: str
+
+
+def identified_correlations(uncertainty: Uncertainty) -> ParameterCorrelations:
     """Names of the identified parameters, and their correlations; NaN without a variance."""
     place = np.flatnonzero(uncertainty.active)
     names = tuple(uncertainty.names.all_names[i] for i in place)
-    return names, uncertainty.correlation[np.ix_(place, place)]
+    return ParameterCorrelations(names, uncertainty.correlation[np.ix_(place, place)])
 
 
 def build_correlation_map(uncertainty: Uncertainty) -> ChartBlock:
@@ -164,7 +178,7 @@ def build_curve_chart(name: str, curve: ResidualCurve, is_held_out: Array) -> Ch
     return build_chart(f"curve-{name}", title, says, traces, layout)
 
 
-def limit_axis_without_outliers(values: Array) -> tuple[list[float], str]:
+def limit_axis_without_outliers(values: Array) -> TrimmedAxis:
     """Limits of an axis that a few far points would stretch, and what to say of these points.
 
     Empty where there are no such points.
@@ -174,10 +188,11 @@ def limit_axis_without_outliers(values: Array) -> tuple[list[float], str]:
     room = 0.25 * (high - low)
     out = int(((known < low - room) | (known > high + room)).sum())
     if np.ptp(known) < MAX_AXIS_STRETCH * (high - low + 2.0 * room) or not high > low:
-        return [], ""
-    return [float(low - room), float(high + room)], (
+        return TrimmedAxis([], "")
+    sentence = (
         f" {out} of {len(known)} points lie outside of what is drawn; a double click shows them."
     )
+    return TrimmedAxis([float(low - room), float(high + room)], sentence)
 
 
 def describe_rms_of_views(views: Sequence[tuple[str, Array]]) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -44,6 +44,35 @@ POSITION_ERROR_LABEL = "position error (mm)"
 HELD_OUT_POSES_LABEL, TRAINING_POSES_LABEL = "held-out poses", "training poses"
 
 
+class PoseGroup(NamedTuple):
+    """Held-out or training poses.  before, after: (m, k) sizes of errors [mm]."""
+
+    name: str
+    before: Array
+    after: Array
+
+
+class ChartPanels(NamedTuple):
+    """Panels side by side, as plotly draws them."""
+
+    traces: list[dict[str, Any]]
+    layout: dict[str, Any]
+
+
+class DrawnPoses(NamedTuple):
+    """Poses drawn one by one.  sentence: how many are not, empty where all are."""
+
+    pose_indices: Array
+    sentence: str
+
+
+class RunningMedian(NamedTuple):
+    """Medians of x and y in bins, (bins,) each."""
+
+    x: Array
+    y: Array
+
+
 def error_lengths(point_errors: Array) -> Array:
     """(m, k) sizes of errors (m, k, 3), NaN where not measured."""
     return np.asarray(np.linalg.norm(point_errors, axis=-1))
@@ -56,12 +85,14 @@ def rms_error_of_each_pose(point_errors: Array) -> Array:
     return np.asarray(np.sqrt(np.nansum(square, axis=1) / np.maximum(seen.sum(axis=1), 1)))
 
 
-def split_held_out_and_training(poses: PosesWithErrors) -> list[tuple[str, Array, Array]]:
+def split_held_out_and_training(poses: PosesWithErrors) -> list[PoseGroup]:
     """Held-out and training poses, those that there are, each with sizes before and after."""
     before, after = error_lengths(poses.before), error_lengths(poses.after)
     parts = ((HELD_OUT_POSES_LABEL, poses.held), (TRAINING_POSES_LABEL, ~poses.held))
     seen = np.isfinite(after).any(axis=1)
-    return [(name, before[rows], after[rows]) for name, rows in parts if (rows & seen).any()]
+    return [
+        PoseGroup(name, before[rows], after[rows]) for name, rows in parts if (rows & seen).any()
+    ]
 
 
 def finite_drawable_values(values: Array) -> Array:
@@ -89,7 +120,7 @@ def build_split_panels(
     x: dict[str, Any],
     y: dict[str, Any],
     **more: Any,
-) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+) -> ChartPanels:
     """Traces and layout of held-out and training poses side by side, on axes x and y."""
     found = split_held_out_and_training(poses)
     traces: list[dict[str, Any]] = []
@@ -99,7 +130,7 @@ def build_split_panels(
         looks = zip(TRACE_LOOKS, names, pair, strict=False)
         traces += [build_trace(look, name, values, i) for look, name, values in looks]
         layout |= build_panel_axes(i, len(found), x, y if i == 0 else {**y, "title": {"text": ""}})
-    return traces, layout
+    return ChartPanels(traces, layout)
 
 
 def build_panel_axes(
@@ -211,14 +242,15 @@ def build_box_trace(
     }
 
 
-def select_drawn_poses(poses: PosesWithErrors) -> tuple[Array, str]:
+def select_drawn_poses(poses: PosesWithErrors) -> DrawnPoses:
     """Indices of the poses drawn one by one, and what to say if these are not all."""
     chosen = select_drawn_indices(rms_error_of_each_pose(poses.after))
     all_of_them = len(chosen) == len(poses.held)
-    return chosen, "" if all_of_them else (
+    sentence = (
         f"{len(chosen)} of {len(poses.held)} poses are drawn: the worst, and an even choice of the "
         "others; lines are of all."
     )
+    return DrawnPoses(chosen, "" if all_of_them else sentence)
 
 
 def pose_hover_texts(poses: PosesWithErrors, pose_indices: Array) -> Array:
@@ -226,11 +258,11 @@ def pose_hover_texts(poses: PosesWithErrors, pose_indices: Array) -> Array:
     return np.array([poses.data.called(poses.data.line[i]) for i in pose_indices])
 
 
-def running_median(x: Array, y: Array) -> tuple[Array, Array]:
+def running_median(x: Array, y: Array) -> RunningMedian:
     """Running median of y in bins of x that hold equally many poses."""
     order = np.argsort(x, kind="stable")
     bins = np.array_split(order, min(MAX_RUNNING_MEDIAN_BINS, max(len(x) // MIN_POSES_PER_BIN, 1)))
-    return (np.array([np.median(x[b]) for b in bins]), np.array([np.median(y[b]) for b in bins]))
+    return RunningMedian(*(np.array([np.median(v[b]) for b in bins]) for v in (x, y)))
 
 
 def joint_axis_titles(poses: PosesWithErrors) -> list[str]:

@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -125,8 +126,8 @@ class ReportJudgement:
         )
 
     @property
-    def verdict_sentence(self) -> str:
-        """Of what which verdict, and where it holds; that it does only without points set aside."""
+    def requirement_verdict_sentence(self) -> str:
+        """The verdict on the requirement, and whether it needs points set aside."""
         if not self.verdict:
             return NO_REQUIREMENT_TEXT
         of = f" for {self.governing_row.short}" if self.governing_row else ""
@@ -164,10 +165,10 @@ class ReportJudgement:
         """For a terminal, beside the table."""
         said = [one.sentence() for one in self.judgements]
         if not self.judgements:
-            return [self.verdict_sentence, *self.set_aside_sentences]
+            return [self.requirement_verdict_sentence, *self.set_aside_sentences]
         told = [self.validity_sentence] if self.governing_row else []
         return [
-            self.verdict_sentence,
+            self.requirement_verdict_sentence,
             *said,
             *self.set_aside_sentences,
             *told,
@@ -195,6 +196,21 @@ class ReportJudgement:
     def failed_requirements(self) -> str:
         """What of the requirement is not passed."""
         return "; ".join(one.sentence() for one in self.judgements if one.verdict == NOT_PASSED)
+
+
+class StepClaims(NamedTuple):
+    """Model and claims of a step of a diagnosis."""
+
+    model: str
+    claims: tuple[AccuracyClaim, ...]
+
+
+class ResultCells(NamedTuple):
+    """Cells of a row of the result: errors [mm], and the 95 % interval."""
+
+    before: float
+    result: float
+    interval: str
 
 
 def judge_sources(
@@ -371,10 +387,8 @@ def build_fit_claims(fit: Fit) -> tuple[AccuracyClaim, ...]:
     return refuse_claims_by_status((inside, build_outside_claim(fit.beyond)), fit.status)
 
 
-def build_claims_at_step(
-    diagnosis: Diagnosis, step_number: int | None
-) -> tuple[str, tuple[AccuracyClaim, ...]]:
-    """Name and claim of a rung of a diagnosis.  Raises OptionError."""
+def build_claims_at_step(diagnosis: Diagnosis, step_number: int | None) -> StepClaims:
+    """What a step of a diagnosis holds, and its claims.  Raises OptionError."""
     rungs = diagnosis.rungs()
     last = len(rungs) - 1
     if step_number is not None and not 0 <= step_number <= last:
@@ -401,7 +415,7 @@ def build_claims_at_step(
     claims = [build_inside_claim(where, diagnosis.ladder[0].holdout, step.holdout, ends, poses)]
     if at == last:
         claims.append(build_outside_claim(diagnosis.beyond))
-    return model, tuple(claims)
+    return StepClaims(model, tuple(claims))
 
 
 def build_relative_claim(sources: ReportSources) -> AccuracyClaim:
@@ -428,7 +442,7 @@ def build_first_page_blocks(
     alarm = "caveat" if kind == "passed" else "warning"  # nothing is red under what is passed
     lines: list[ReportBlock] = [
         NoteBlock(
-            capitalise_sentence(judgement.verdict_sentence),
+            capitalise_sentence(judgement.requirement_verdict_sentence),
             f"banner {kind}" if judgement.verdict else "text",
         ),
         *describe_cause(sources),
@@ -575,11 +589,12 @@ def build_result_table(judgement: ReportJudgement) -> Table:
     return every.select_columns(*range(first, last))
 
 
-def format_result_cells(before: float, bound: ErrorBound) -> tuple[float, float, str]:
+def format_result_cells(before: float, bound: ErrorBound) -> ResultCells:
     """Cells of a row: before, result, its interval."""
     most = bound.high if bound.high > bound.value else math.nan  # what was seen is no limit
     low, high = ("" if math.isnan(end) else f"{end:.3f}" for end in (bound.low, most))
-    return before, bound.value, f"{low or 'up'} to {high}" if high else f"from {low}" if low else ""
+    interval = f"{low or 'up'} to {high}" if high else f"from {low}" if low else ""
+    return ResultCells(before, bound.value, interval)
 
 
 def describe_basis_of_numbers(judgement: ReportJudgement) -> str:

@@ -11,7 +11,7 @@ import gzip
 import hashlib
 import json
 from importlib import resources
-from typing import Any
+from typing import Any, NamedTuple
 
 from minimax_cal.core.optional_packages import import_optional
 from minimax_cal.core.tables import Table
@@ -32,6 +32,13 @@ TEMPLATE_BLOCK_KINDS = {
     View3dBlock: "view",
 }
 UNSAFE_SCRIPT_LETTERS = {letter: f"\\u{ord(letter):04x}" for letter in "<>&\u2028\u2029"}
+
+
+class ReportPackages(NamedTuple):
+    """The imported modules jinja2 and plotly.offline."""
+
+    jinja: Any
+    plotly_offline: Any
 
 
 def render_html(report: ReportDocument, *, for_print: bool = False) -> str:
@@ -64,13 +71,13 @@ def render_html(report: ReportDocument, *, for_print: bool = False) -> str:
     return whole
 
 
-def import_report_packages() -> tuple[Any, Any]:
+def import_report_packages() -> ReportPackages:
     """The packages that draw the page: jinja2, plotly.offline.  Raises OptionError."""
     jinja, offline = (
         import_optional(name, "a report", "minimax-cal[report]")
         for name in ("jinja2", "plotly.offline")
     )
-    return jinja, offline
+    return ReportPackages(jinja, offline)
 
 
 def read_package_file(name: str, package: str = HTML_PACKAGE_NAME) -> str:

@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import version
-from typing import Any
+from typing import Any, NamedTuple
 
 from minimax_cal.core.display_text import replace_invisible_and_bidi_characters
 from minimax_cal.core.tables import Table, drop_empty_tables
@@ -68,6 +68,13 @@ APPENDIX_SECTIONS = (
     ("solution", "How the fit was found", skip_without_fit(report_appendix.build_solution_blocks)),
     ("simulator", "The arm in the simulator", report_appendix.build_simulator_blocks),
 )
+
+
+class SignatureLine(NamedTuple):
+    """A row to sign.  name: empty where it is written by hand."""
+
+    role: str
+    name: str
 
 
 @dataclass(frozen=True)
@@ -147,10 +154,14 @@ def strip_folders(file_text: str) -> str:
     return FOLDER_PREFIX_PATTERN.sub("", replace_invisible_and_bidi_characters(file_text))
 
 
-def list_signatures(author: str, customer: str) -> tuple[tuple[str, str], ...]:
+def list_signatures(author: str, customer: str) -> tuple[SignatureLine, ...]:
     """Who signs: role, and name where it is known."""
     accepted = f"Accepted for {customer}" if customer else "Accepted"
-    return (("Measured and evaluated", author), ("Checked", ""), (accepted, ""))
+    return (
+        SignatureLine("Measured and evaluated", author),
+        SignatureLine("Checked", ""),
+        SignatureLine(accepted, ""),
+    )
 
 
 def describe_pose_counts(sources: ReportSources) -> str:

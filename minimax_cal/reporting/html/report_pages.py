@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import groupby
 from operator import itemgetter
+from typing import NamedTuple
 
 import numpy as np
 
@@ -77,6 +78,20 @@ NOT_IDENTIFIED_NOTES = {
 }
 
 
+class CauseSentences(NamedTuple):
+    """Sentences of a diagnosis."""
+
+    of_causes: tuple[str, ...]
+    others: tuple[str, ...]
+
+
+class LargestRotation(NamedTuple):
+    """How far effects turn a joint at most [mrad], and at which pose."""
+
+    milliradians: float
+    pose_name: str
+
+
 def before_and_after_names(sources: ReportSources) -> BeforeAfterNames:
     """What before and after are called."""
     return ("nominal", "calibrated") if sources.fit else ("geometry alone", "with effects")
@@ -84,10 +99,10 @@ def before_and_after_names(sources: ReportSources) -> BeforeAfterNames:
 
 def split_cause_sentences(
     diagnosis: Diagnosis | RelativeDiagnosis,
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
+) -> CauseSentences:
     """The sentences of a diagnosis that name its causes, for the page to sign, and the others."""
     count = max(sum(map(bool, describe_main_causes(diagnosis))), 1)
-    return diagnosis.reasons[:count], diagnosis.reasons[count:]
+    return CauseSentences(diagnosis.reasons[:count], diagnosis.reasons[count:])
 
 
 # ---- error budget --------------------------------------------------------------------------------
@@ -157,13 +172,13 @@ def build_error_location_page(sources: ReportSources) -> ReportBlocks:
     return drawn
 
 
-def largest_joint_rotations(sources: ReportSources) -> dict[str, tuple[float, str]]:
+def largest_joint_rotations(sources: ReportSources) -> dict[str, LargestRotation]:
     """How far effects turn each joint at most [mrad], and at which pose."""
     if not sources.joint_rotations_by_effects:
         return {}
     data, turn = sources.joint_rotations_by_effects
     return {
-        f"J{i + 1}": (1e3 * float(turn[pose, i]), data.row_name(int(pose)))
+        f"J{i + 1}": LargestRotation(1e3 * float(turn[pose, i]), data.row_name(int(pose)))
         for i, pose in enumerate(turn.argmax(axis=0))
     }
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -81,6 +81,28 @@ class ResultFile:
     digest: str
 
 
+class JointRotations(NamedTuple):
+    """How far all effects turn each joint: rotations (m, n) at the poses [rad]."""
+
+    measurements: Measurements
+    rotations: Array
+
+
+class NamedResult(NamedTuple):
+    """A result and its kind."""
+
+    kind: str
+    result: Fit | Diagnosis | RelativeCalibration
+
+
+class ResultContent(NamedTuple):
+    """JSON of a result, the name of its file, and its SHA-256."""
+
+    content: dict[str, Any]
+    name: str
+    sha256: str
+
+
 @dataclass(frozen=True, eq=False)
 class ReportSources:
     """A calibration, a diagnosis, or both, and the arm in a simulator; or a relative calibration.
@@ -129,7 +151,7 @@ class ReportSources:
         return None
 
     @cached_property
-    def joint_rotations_by_effects(self) -> tuple[Measurements, Array] | None:
+    def joint_rotations_by_effects(self) -> JointRotations | None:
         """The poses, and how far all effects turn each joint there: (m, n), 0 of a slide [rad].
 
         None where none turns one, or the file does not tell.
@@ -141,7 +163,7 @@ class ReportSources:
             return None
         turn = np.abs(cell.effects.joint_shifts(cell.pose_arm(add_history_columns(poses.data))))
         turn[:, poses.data.sliding] = 0.0
-        return (poses.data, turn) if turn.any() else None
+        return JointRotations(poses.data, turn) if turn.any() else None
 
     @property
     def cell(self) -> Cell | None:
@@ -153,14 +175,14 @@ class ReportSources:
 
 def list_named_results(
     sources: ReportSources,
-) -> list[tuple[str, Fit | Diagnosis | RelativeCalibration]]:
+) -> list[NamedResult]:
     """The results with what they are."""
     every = (
         ("calibration", sources.fit),
         ("diagnosis", sources.gap),
         (RELATIVE_CALIBRATION_KIND, sources.relative),
     )
-    return [(kind, result) for kind, result in every if result]
+    return [NamedResult(kind, result) for kind, result in every if result]
 
 
 def read_report_sources(results: Sequence[ReportableResult]) -> ReportSources:
@@ -245,15 +267,14 @@ def warn_of_unrelated_simulator_gap(
     return (f"The gap in the simulator is of other measurements than the rest{other or '.'}",)
 
 
-def read_result_content(result: ReportableResult) -> tuple[dict[str, Any], str, str]:
+def read_result_content(result: ReportableResult) -> ResultContent:
     """JSON, name and SHA-256 of a result, every text visible."""
     if isinstance(result, Path | str):
-        content, digest = read_json_object(result)
-        return content, str(result), digest
+        return read_json_object(result)
     text = result.json()
     content = replace_control_characters_in_json(json.loads(text))
     digest = hashlib.sha256(text.encode("utf-8")).hexdigest()
-    return content, f"{content['kind']}, not saved", digest
+    return ResultContent(content, f"{content['kind']}, not saved", digest)
 
 
 def check_results_belong_together(
@@ -285,7 +306,7 @@ def check_results_belong_together(
     return tuple(out)
 
 
-def read_json_object(path: Path | str) -> tuple[dict[str, Any], str]:
+def read_json_object(path: Path | str) -> ResultContent:
     """A JSON object with its text cleaned, and the SHA-256 of the file."""
     raw = read_bytes(path)
     try:
@@ -294,7 +315,7 @@ def read_json_object(path: Path | str) -> tuple[dict[str, Any], str]:
         raise CalibrationError(f"{path}: is not JSON ({error})") from error
     if not isinstance(content, dict):
         raise CalibrationError(f"{path}: is neither a calibration nor a diagnosis")
-    return content, hashlib.sha256(raw).hexdigest()
+    return ResultContent(content, str(path), hashlib.sha256(raw).hexdigest())
 
 
 def replace_control_characters_in_json(value: Any) -> Any:

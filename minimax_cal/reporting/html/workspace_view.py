@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -92,7 +92,14 @@ def clip_tracker_to_workspace(workspace: DrawnWorkspace) -> Array:
     return np.asarray(workspace.centre + min(far, 1.0) * sight)
 
 
-def arm_polylines(robot: Robot, q: Array) -> tuple[Array, Array]:
+class ArmPolylines(NamedTuple):
+    """The arm as lines.  See `arm_polylines`."""
+
+    vertices: Array
+    is_joint: Array
+
+
+def arm_polylines(robot: Robot, q: Array) -> ArmPolylines:
     """The arm as a chain of lines: (m, v, 3) [mm], and (v,) True where a joint is.
 
     Each link goes along its joint axis by d, then along its normal by a.  q: (m, n) [rad, m].
@@ -109,7 +116,7 @@ def arm_polylines(robot: Robot, q: Array) -> tuple[Array, Array]:
                 joints.append(corner)
             elif corner:
                 joints[-1] = True
-    return 1e3 * np.stack(spots, axis=1), np.array(joints)
+    return ArmPolylines(1e3 * np.stack(spots, axis=1), np.array(joints))
 
 
 def choose_magnification(workspace: DrawnWorkspace, errors: Array) -> int:
