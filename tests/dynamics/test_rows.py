@@ -76,7 +76,7 @@ def test_rows_at_rest_near_reversals_and_gaps_are_not_fitted() -> None:
     logs = resample_and_filter_runs([run_of("one", time[cut], q[cut], run.torque[cut])])
     at = logs.since[logs.row_samples]
     assert not logs.is_row_moving[(at > 10.3) & (at < 11.7)].any()
-    assert not logs.is_row_fitted[
+    assert not logs.fitted_row_mask_by_joint[
         (at > 20.0 - UNUSED_EDGE_DURATION + 0.02) & (at < 20.5 + UNUSED_EDGE_DURATION - 0.02)
     ].any()
     speed = np.stack([np.interp(at, time, column) for column in qd.T], axis=1)
@@ -84,11 +84,11 @@ def test_rows_at_rest_near_reversals_and_gaps_are_not_fitted() -> None:
     assert not (logs.is_row_moving[1:] & flips)[at[1:] < 9.0].any()
     near = np.abs(at[:, None] - at[1:][flips[:, 1] & (at[1:] < 9.0)]).min(axis=1)
     assert (
-        near[logs.is_row_fitted[:, 1] & (at < 9.0)].min() > 0.15 - 0.04
+        near[logs.fitted_row_mask_by_joint[:, 1] & (at < 9.0)].min() > 0.15 - 0.04
     )  # a row of 25 Hz apart at most
     assert near[logs.is_row_moving[:, 1] & (at < 9.0)].min() < 0.14  # but counted as moving
-    assert logs.is_row_fitted[at < 9.0].mean() > 0.25
-    assert not logs.is_row_fitted[1::2].any()
+    assert logs.fitted_row_mask_by_joint[at < 9.0].mean() > 0.25
+    assert not logs.fitted_row_mask_by_joint[1::2].any()
 
 
 def test_runs_stand_one_after_another() -> None:
@@ -129,7 +129,7 @@ def test_noise_is_white_after_whitening_across_gaps_too() -> None:
     for run in range(2):  # as the rows that are fitted remember each other
         rows = np.flatnonzero(logs.run_index == run)[::2]
         noise[:, rows] = np.stack([remembering(rng, len(rows)) for _ in size]) * size[:, None]
-    rest = noise[logs.is_row_fitted.T]
+    rest = noise[logs.fitted_row_mask_by_joint.T]
     white = estimate_autoregressive_whitening(logs, rest)
     out = white.whiten_rows(rest)
     for j in range(3):
@@ -150,5 +150,5 @@ def test_noise_is_white_after_whitening_across_gaps_too() -> None:
 def test_computed_torques_have_a_noise() -> None:
     run, *_ = log(8)
     logs = resample_and_filter_runs([run])
-    white = estimate_autoregressive_whitening(logs, np.zeros(int(logs.is_row_fitted.sum())))
+    white = estimate_autoregressive_whitening(logs, np.zeros(int(logs.fitted_row_mask_by_joint.sum())))
     assert np.isfinite(white.predictor_weights).all()
