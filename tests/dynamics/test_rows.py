@@ -150,5 +150,7 @@ def test_noise_is_white_after_whitening_across_gaps_too() -> None:
 def test_computed_torques_have_a_noise() -> None:
     run, *_ = log(8)
     logs = resample_and_filter_runs([run])
-    white = estimate_autoregressive_whitening(logs, np.zeros(int(logs.fitted_row_mask_by_joint.sum())))
+    white = estimate_autoregressive_whitening(
+        logs, np.zeros(int(logs.fitted_row_mask_by_joint.sum()))
+    )
     assert np.isfinite(white.predictor_weights).all()
