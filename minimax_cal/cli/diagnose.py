@@ -139,7 +139,8 @@ def suggest_next_commands(
     rows_in_visit_order: bool,
 ) -> Iterator[SuggestedCommand]:
     """What to do next, and its command.  written_path: where the diagnosis went."""
-    if diagnosis.main_findings and diagnosis.status is Status.CONVERGED:
+    is_next_named = bool(diagnosis.main_findings) and diagnosis.status is Status.CONVERGED
+    if is_next_named:
         files = shlex.join(map(str, data))
         told, usual = diagnosis.provenance.settings, vars(DiagnosisOptions())
         given = [n for n in ("seed", "holdout", "holdout_by", "instrument") if told[n] != usual[n]]
@@ -159,8 +160,8 @@ def suggest_next_commands(
         yield SuggestedCommand(
             "Then, to correct joint targets, or a program, for the controller", correct
         )
-    keep = "" if written_path else "-o diagnosis.json "
-    what = "To see" if written_path else "To keep the result, and to see"
+    keep = "" if written_path or is_next_named else "-o diagnosis.json "
+    what = "To keep the result, and to see" if keep else "To see"
     yield SuggestedCommand(f"{what} every effect, parameter and table", f"add {keep}--details")
 
 

@@ -39,10 +39,8 @@ ONE_THREAD_ENVIRONMENT = dict.fromkeys(
 JOBLIB_REQUIREMENT = "minimax-cal[jobs]"
 DISTRIBUTED_REQUIREMENT = "minimax-cal[distributed]"
 
-REUSED_PROCESS_POOL: list[
-    Any
-    # the pool of this process that `run_in_processes_and_here` made last, which stays for the next
-] = []
+# The pool of this process that `run_in_processes_and_here` made last, which stays for the next.
+REUSED_PROCESS_POOL: list[Any] = []
 
 
 class Task(NamedTuple):

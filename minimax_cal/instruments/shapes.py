@@ -273,7 +273,7 @@ def build_surface_unknowns(
     return SurfaceStart(shapes, own)
 
 
-class FittedBody(NamedTuple):
+class BodyFrameAndRadius(NamedTuple):
     """Rotation (3, 3) and origin (3,) of a body, and the radius of the ball [m]."""
 
     rotation: Array
@@ -287,7 +287,7 @@ def fit_body_and_ball_radius(
     surfaces: tuple[Surface, ...],
     ball_radius: float,
     touched_surface: Array,
-) -> FittedBody:
+) -> BodyFrameAndRadius:
     """Rotation (3, 3) and origin (3,) of the body by its faces, and the radius of the ball [m].
 
     The ball touches from outside, so that the other contacts with the body lie inwards.
@@ -298,7 +298,7 @@ def fit_body_and_ball_radius(
                if s.kind == SPHERE_KIND and np.isfinite(s.size)]  # fmt: skip
     radius = float(np.mean(spheres)) if spheres and not np.isfinite(ball_radius) else radius
     if not faces:
-        return FittedBody(np.eye(3), np.zeros(3), radius)
+        return BodyFrameAndRadius(np.eye(3), np.zeros(3), radius)
     middle = ball_centres[np.isin(touched_surface, faces)].mean(axis=0)
     outward = []
     for at in faces:
@@ -318,9 +318,9 @@ def fit_body_and_ball_radius(
         ball_radius if np.isfinite(ball_radius) else 0.0
     )
     if not known:
-        return FittedBody(turn, middle, radius)
+        return BodyFrameAndRadius(turn, middle, radius)
     found = solve_body_origin_and_radius(rows, reached - sizes, middle)
-    return FittedBody(
+    return BodyFrameAndRadius(
         turn, found[:3], float(found[3]) if np.isnan(ball_radius) and len(known) > 3 else radius
     )
 

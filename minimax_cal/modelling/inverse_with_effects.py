@@ -21,6 +21,7 @@ from minimax_cal.robots.inverse_kinematics import (
     solve_joints_with_restarts,
     solve_nearest_joints,
 )
+from minimax_cal.robots.joint_ranges import JointBounds
 
 SLIDE_METRES_PER_RADIAN = (
     0.5  # metres a slide may change by where a turning joint may by a radian [m/rad]
@@ -134,14 +135,7 @@ def effect_joint_shifts_and_flange_motions(cell: Cell, data: Measurements) -> tu
     return turn, fit_rigid_motions(before, before + np.moveaxis(shift, -1, 0))
 
 
-class JointBounds(NamedTuple):
-    """Least and largest joint values that are allowed, (m, n) each."""
-
-    lower: Array
-    upper: Array
-
-
-class InverseSolution(NamedTuple):
+class JointsAndOutcomes(NamedTuple):
     """Corrected joint values (m, n), and how each target ended."""
 
     q: Array
@@ -204,7 +198,7 @@ class InverseProblem:
         distance, angle = self.position_and_angle_errors(q)
         return (distance <= self.tolerance) & (self.lever * angle <= self.tolerance)
 
-    def solve(self) -> InverseSolution:
+    def solve(self) -> JointsAndOutcomes:
         """Corrected joints, and how each target ended.
 
         Goals that cannot be reached are sought again with a price on change: the arm then does
@@ -218,7 +212,7 @@ class InverseProblem:
                 begin, np.where(good, 0.0, CHANGE_WEIGHT_PER_LEVER)
             )
             good = self.reached_mask(q)
-        return InverseSolution(q, self.classify_outcomes(q, good, settled))
+        return JointsAndOutcomes(q, self.classify_outcomes(q, good, settled))
 
     def solve_consistent_with_effects(self, q: Array, change_weights: Array) -> ConsistentJoints:
         """Joints that agree with the effects they cause, and (m,) True where they do.

@@ -38,7 +38,7 @@ def link_parameter_names(joint_count: int, *, modified: bool) -> tuple[str, ...]
     )
 
 
-class FileRows(NamedTuple):
+class FileLinkRows(NamedTuple):
     """Rows (n, 5) in a file's convention, and (5,) what follows the last joint of Craig's."""
 
     rows: Array
@@ -81,17 +81,17 @@ class DhNotation:
             out[0, [THETA, D]] = -1.0
         return out
 
-    def rows_in_file_convention(self, mdh: Array, prismatic: Array) -> FileRows:
+    def rows_in_file_convention(self, mdh: Array, prismatic: Array) -> FileLinkRows:
         """(n, 5) rows as the file has them, and (5,) what follows the last joint of Craig's."""
         told = self.values_in_file_convention(mdh, prismatic)
         if not self.modified:
-            return FileRows(told, np.zeros(5))
+            return FileLinkRows(told, np.zeros(5))
         first = np.zeros(5)
         first[ALPHA] = np.pi * self.half_turn
         end, rows = told[-1].copy(), told.copy()
         rows[:, CRAIG_SHIFTED_COLUMNS] = np.vstack([first, told[:-1]])[:, CRAIG_SHIFTED_COLUMNS]
         end[[D, THETA]] = 0.0
-        return FileRows(rows, end)
+        return FileLinkRows(rows, end)
 
 
 STANDARD_NOTATION = DhNotation()

@@ -12,7 +12,7 @@ DEFAULT_SLIDE_RANGE = 0.5  # how far a slide without limits goes to either side 
 
 
 class JointBounds(NamedTuple):
-    """Lowest and highest joint values (n,) [rad, m]."""
+    """Lowest and highest joint values, (n,) or one row for each pose (m, n) [rad, m]."""
 
     lower: Array
     upper: Array

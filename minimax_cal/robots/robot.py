@@ -650,16 +650,17 @@ def load_robot(source: Robot | Path | str) -> Robot:
     if isinstance(source, Robot) or str(source) in builtin_robots():
         return source if isinstance(source, Robot) else load_builtin_robot(str(source))
     path = Path(source)
-    conf, _, ur_name = str(source).rpartition("#") if ".conf#" in str(source) else (path, "", "")
-    if Path(conf).suffix.lower() == ".conf":
-        from minimax_cal.robots.ur_files import read_ur_calibration  # few robots come as one
-
-        return read_ur_calibration(Path(conf), ur_name)
     from minimax_cal.robots.urdf_robot import (
         is_urdf_or_mjcf_source,
         load_urdf,
+        split_file_and_link_names,
     )  # not for a built-in robot
 
+    file, ur_name = split_file_and_link_names(source)
+    if file.lower().endswith(".conf"):
+        from minimax_cal.robots.ur_files import read_ur_calibration  # few robots come as one
+
+        return read_ur_calibration(Path(file), ur_name)
     if is_urdf_or_mjcf_source(source):
         found = load_urdf(source)
         return replace(

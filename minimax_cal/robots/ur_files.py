@@ -15,7 +15,8 @@ from minimax_cal.core.errors import RobotError
 from minimax_cal.core.files import read_text
 from minimax_cal.robots.parallel_axes import move_frames_along_parallel_axes
 from minimax_cal.robots.robot import Robot, builtin_robots, load_builtin_robot, robot_from_dict
-from minimax_cal.robots.urdf_file import parse_urdf
+from minimax_cal.robots.transforms import transform_from_xyz_rpy
+from minimax_cal.robots.urdf_file import Urdf, UrdfJoint
 from minimax_cal.robots.urdf_robot import convert_urdf_to_robot
 
 UR_LINK_NAMES = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
@@ -80,22 +81,31 @@ def convert_ur_kinematics(content: Mapping[str, Any], source: str) -> Robot:
 
     Raises RobotError.
     """
-    lines = ['<robot name="ur"><link name="base"/>']
-    parent = "base"
+    joints: list[UrdfJoint] = []
+    parent = root = "base"
     for name in UR_LINK_NAMES:
         row = content["kinematics"][name]
         try:
-            x, y, z, roll, pitch, yaw = (float(row[key]) for key in UR_ORIGIN_KEYS)
+            numbers = np.array([float(row[key]) for key in UR_ORIGIN_KEYS])
+            if not np.isfinite(numbers).all():
+                raise ValueError
         except (KeyError, TypeError, ValueError) as error:
             keys = ", ".join(UR_ORIGIN_KEYS)
             raise RobotError(f"{source}: {name} needs the numbers {keys}") from error
-        lines.append(
-            f'<link name="{name}"/><joint name="{name}_joint" type="continuous">'
-            f'<parent link="{parent}"/><child link="{name}"/><axis xyz="0 0 1"/>'
-            f'<origin xyz="{x!r} {y!r} {z!r}" rpy="{roll!r} {pitch!r} {yaw!r}"/></joint>'
+        joints.append(
+            UrdfJoint(
+                name=f"{name}_joint",
+                kind="continuous",
+                parent=parent,
+                child=name,
+                origin=transform_from_xyz_rpy(numbers[:3], numbers[3:]),
+                axis=np.array([0.0, 0.0, 1.0]),
+                lower=-np.inf,
+                upper=np.inf,
+                mimic=None,
+            )
         )
         parent = name
-    urdf = parse_urdf("\n".join([*lines, "</robot>"]).encode(), source)
-    found = convert_urdf_to_robot(urdf)
+    found = convert_urdf_to_robot(Urdf(source, b"", "ur", root, tuple(joints), {}))
     robot = robot_from_dict(found.content | {"name": Path(source).stem}, source)
     return replace(robot, notices=found.base_and_tool_notices)

@@ -59,8 +59,8 @@ class ModelServos:
     gravity_free: bool = False
 
     @staticmethod
-    def zeros(joint_count: int) -> ModelServos:
-        """Of a new file."""
+    def of_joints_without_drives(joint_count: int) -> ModelServos:
+        """All gains and damping 0 and torques unlimited, as a new file has it."""
         zeros, limits = np.zeros(joint_count), np.array([[-np.inf, np.inf]] * joint_count)
         return ModelServos(zeros, zeros, zeros, limits, np.ones(joint_count, dtype=bool))
 

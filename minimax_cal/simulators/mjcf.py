@@ -170,6 +170,6 @@ def build_new_tree(
     tree = MjcfTree(root)
     layout = ArmLayout(tree, names, tuple(bodies), tuple(joints),
                     np.broadcast_to(np.eye(4), (n, 4, 4)), np.zeros((n, 3)), axes,
-                    ModelServos.zeros(n), np.zeros(n), NEW_TIMESTEP)  # fmt: skip
+                    ModelServos.of_joints_without_drives(n), np.zeros(n), NEW_TIMESTEP)  # fmt: skip
     write_arm_elements(layout, arm, target_names, with_springs=with_springs)
     return tree

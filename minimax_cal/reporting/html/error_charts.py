@@ -59,7 +59,7 @@ class ChartPanels(NamedTuple):
     layout: dict[str, Any]
 
 
-class DrawnPoses(NamedTuple):
+class ChartedPoses(NamedTuple):
     """Poses drawn one by one.  sentence: how many are not, empty where all are."""
 
     pose_indices: Array
@@ -242,7 +242,7 @@ def build_box_trace(
     }
 
 
-def select_drawn_poses(poses: PosesWithErrors) -> DrawnPoses:
+def select_drawn_poses(poses: PosesWithErrors) -> ChartedPoses:
     """Indices of the poses drawn one by one, and what to say if these are not all."""
     chosen = select_drawn_indices(rms_error_of_each_pose(poses.after))
     all_of_them = len(chosen) == len(poses.held)
@@ -250,7 +250,7 @@ def select_drawn_poses(poses: PosesWithErrors) -> DrawnPoses:
         f"{len(chosen)} of {len(poses.held)} poses are drawn: the worst, and an even choice of the "
         "others; lines are of all."
     )
-    return DrawnPoses(chosen, "" if all_of_them else sentence)
+    return ChartedPoses(chosen, "" if all_of_them else sentence)
 
 
 def pose_hover_texts(poses: PosesWithErrors, pose_indices: Array) -> Array:
